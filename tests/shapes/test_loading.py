@@ -189,7 +189,7 @@ def test_the_collector_runs_again_after_pauses_that_overlap():
 def tables(shape):
     """What shapes of one topology share; that of exact shading only where it has been asked for."""
     surface = shape._parameters.surface
-    found = [surface.cage.structure, surface.patches, shape._triangles.table, shape._triangles.layout]
+    found = [surface.cage.structure, surface.patches, shape._mesh.table, shape._mesh.layout]
     found += [surface.channel(name).layout for name in surface.attribute_names]
     return [*found, surface.pieces()] if shape._exact is not None else found
 
@@ -215,7 +215,7 @@ def test_shapes_of_equal_topology_share_all_but_positions(shading, rate, tmp_pat
                 assert mi.traverse(shape)[name].index == mi.traverse(first)[name].index
         assert not np.array_equal(buffers(first)["vertex_positions"], buffers(others[0])["vertex_positions"])
     assert files[0]._parameters.surface.patches is from_arrays[0]._parameters.surface.patches
-    assert files[0]._triangles.table is from_arrays[0]._triangles.table
+    assert files[0]._mesh.table is from_arrays[0]._mesh.table
 
 
 @every_variant
@@ -236,14 +236,14 @@ def test_shapes_of_equal_topology_share_all_but_positions(shading, rate, tmp_pat
 def test_shapes_of_other_tags_or_rules_share_no_patches(change):
     one, two = (made(cage) for cage in (cube(), cube(**change)))
     assert one._parameters.surface.patches is not two._parameters.surface.patches
-    assert one._triangles.table is not two._triangles.table
+    assert one._mesh.table is not two._mesh.table
 
 
 @every_variant
 def test_shapes_of_another_rate_or_scheme_share_no_tessellation():
     options = {}, {"tessellation_rate": 3}, {"scheme": "doo_sabin"}
     shapes = [mi.load_dict({**of(cube()), **each}) for each in options]
-    assert len({id(shape._triangles.table) for shape in shapes}) == 3
+    assert len({id(shape._mesh.table) for shape in shapes}) == 3
     patches = [shape._parameters.surface.patches for shape in shapes]
     assert patches[0] is patches[1] is not patches[2]
 

@@ -56,7 +56,7 @@ class ShapeDisplacement:
         self,
         variant: Variant,
         surface: LimitSurface,
-        positions: FloatArray,  # (n, 3) float64: control points, relative to the centre of `RecentredPoints`
+        positions: FloatArray,  # (n, 3) float64: control points, relative to the centre of `Placement`
         given: Any,  # Value of the parameter ``displacement``
         scale: float,
         exact: ExactShading | None,  # Exact shading of the shape, whose surface is displaced, too

@@ -61,7 +61,7 @@ class ExactShading:
         self,
         variant: Variant,
         surface: LimitSurface,
-        # (n, 3) float64: control points of the surface, relative to the centre of `RecentredPoints`
+        # (n, 3) float64: control points of the surface, relative to the centre of `Placement`
         positions: NDArray[np.float64],
         *,
         use_stam: bool,  # Whether to evaluate by Stam's form

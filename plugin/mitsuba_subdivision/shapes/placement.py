@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -42,12 +41,17 @@ def checked_matrix(transform: Any, name: str = "to_world") -> NDArray[np.float64
     return matrix
 
 
-class RecentredPoints:
-    """Control points relative to a centre, if they are far from the origin.
+class Placement:
+    """Where a shape lies: ``to_world``, and a centre that control points far from the origin are relative to.
 
     In single precision such points lose digits, which is visible in normals. So a coordinate with the value that was
     loaded is replaced by its double-precision value relative to the centre.
     """
+
+    matrix: Matrix4  # Dr.Jit matrix attached to the parameter; NumPy matrix in scalar variants
+    parameter: Matrix4  # The parameter: NumPy matrix, or detached Dr.Jit matrix if it cannot be read
+    is_identity: bool  # Whether the matrix is the identity and is not differentiated
+    mirrors: bool  # Whether the map is a reflection, which reverses the orientation of triangles
 
     def __init__(
         self,
@@ -69,7 +73,31 @@ class RecentredPoints:
             self._relative = mapped(float_type, self.positions)
             self._centres = mapped(float_type, np.tile(centre, len(positions)))
 
-    def __call__(self, control_points: FloatBuffer) -> FloatBuffer:
+    def take(
+        self,
+        to_world: mi.AffineTransform4f,
+        # (4, 4) float64: its checked matrix. None while a frozen function is recorded, when it cannot be read: it is
+        # then assumed to be a reflection if the last one was.
+        value: NDArray[np.float64] | None,
+    ) -> None:
+        """Set ``to_world``."""
+        matrix: Matrix4 = to_world.matrix
+        is_jit, is_moving = dr.is_jit_v(matrix), dr.grad_enabled(matrix)
+        self.matrix = matrix if is_jit else value
+        if self.centre is not None:
+            shift = np.eye(4)
+            shift[:3, 3] = self.centre
+            self.matrix = self.matrix @ (type(matrix)(shift.tolist()) if is_jit else shift)
+        if value is None:
+            self.parameter, self.is_identity = dr.detach(matrix), False
+        else:
+            self.parameter, self.mirrors = value, bool(np.linalg.det(value[:3, :3]) < 0)
+            self.is_identity = self.centre is None and not is_moving and np.array_equal(value, np.eye(4))
+        if is_jit:
+            # Dr.Jit compiles literals into kernels.
+            dr.make_opaque(to_world, self.matrix)
+
+    def relative(self, control_points: FloatBuffer) -> FloatBuffer:
         """Return flat control points relative to the centre."""
         # The functions that use the points check their number.
         if self.centre is None or len(control_points) != len(self._loaded):
@@ -78,35 +106,6 @@ class RecentredPoints:
         relative = dr.select(control_points == self._loaded, self._relative, moved)
         # Attach replaced coordinates to the control points.
         return dr.replace_grad(relative, moved) if dr.grad_enabled(control_points) else relative  # type: ignore[func-returns-value]  # The stub is wrong.
-
-
-@dataclass(frozen=True, eq=False)
-class Placement:
-    """The map of ``to_world`` for points relative to the centre of `RecentredPoints`."""
-
-    matrix: Matrix4  # Dr.Jit matrix attached to the parameter; NumPy matrix in scalar variants
-    parameter: Matrix4  # The parameter: NumPy matrix, or detached Dr.Jit matrix if it cannot be read
-    is_identity: bool  # Whether the matrix is the identity and is not differentiated
-    mirrors: bool  # Whether the map is a reflection, which reverses the orientation of triangles
-
-    @classmethod
-    def of(
-        cls,
-        to_world: mi.AffineTransform4f,
-        value: NDArray[np.float64],  # (4, 4) float64: matrix of ``to_world``
-        centre: NDArray[np.float64] | None,  # (3,) float64 or None
-    ) -> Placement:
-        """The placement of a transformation."""
-        matrix = cls._recentred(to_world.matrix if dr.is_jit_v(to_world.matrix) else value, centre)
-        is_identity = np.array_equal(value, np.eye(4)) and centre is None and not dr.grad_enabled(to_world.matrix)
-        return cls(matrix, value, is_identity, bool(np.linalg.det(value[:3, :3]) < 0))
-
-    def recorded(self, to_world: mi.AffineTransform4f, centre: NDArray[np.float64] | None) -> Placement:
-        """The placement of a transformation while a frozen function is recorded, when its value cannot be read.
-
-        It is assumed to be a reflection if this placement is one.
-        """
-        return Placement(self._recentred(to_world.matrix, centre), dr.detach(to_world.matrix), False, self.mirrors)
 
     def inverse(self) -> Matrix4:
         """Inverse of the parameter, without the centre, as a detached Dr.Jit matrix."""
@@ -131,11 +130,3 @@ class Placement:
         lengths = np.linalg.norm(n, axis=1, keepdims=True)
         np.divide(n, lengths, out=n, where=lengths > 0)
         return p.ravel(), n.ravel()
-
-    @staticmethod
-    def _recentred(matrix: Matrix4, centre: NDArray[np.float64] | None) -> Matrix4:
-        if centre is None:
-            return matrix
-        shift = np.eye(4)
-        shift[:3, 3] = centre
-        return matrix @ (type(matrix)(shift.tolist()) if dr.is_jit_v(matrix) else shift)

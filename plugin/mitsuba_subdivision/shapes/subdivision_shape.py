@@ -17,12 +17,12 @@ from ..variants import Variant
 from .cage_attributes import PREFIX, CageAttributes, mesh_attributes, mesh_name
 from .derivatives import on_backward_of
 from .device_state import DeviceState, is_recording, paused_collection, traversed
+from .mesh_buffers import MeshBuffers, require_control_points
 from .parameter_table import errors_about, plugin_page
 from .parameters import Parameters, read_parameters
-from .placement import Placement, RecentredPoints, checked_matrix
+from .placement import Placement, checked_matrix
 from .registration import on_shallow_stack
 from .tessellation_parameters import Tessellation
-from .vertices import MovingVertices, Triangles, require_control_points
 
 if TYPE_CHECKING:
     from .displacement import ShapeDisplacement
@@ -47,7 +47,6 @@ def make_subdivision(
         """
 
         __doc__ = plugin_page()
-        _placement: Placement
 
         @on_shallow_stack
         @paused_collection()
@@ -66,7 +65,7 @@ def make_subdivision(
             kind = variant.Float if is_jit else dr.scalar.ArrayXf
             # Mitsuba samples textured emitters by the mesh's texture coordinates.
             self._has_textured_emitter = _has_textured_emitter(props, variant)
-            self._points = RecentredPoints(surface.cage.positions, kind, recentres=parameters.evaluator == "stabilized")
+            self._placement = Placement(surface.cage.positions, kind, recentres=parameters.evaluator == "stabilized")
             self._exact: ExactShading | None = None
             # The triangles over texture coordinates; None until they are needed.
             self._texture_scene: Any = None
@@ -74,9 +73,8 @@ def make_subdivision(
             if is_exact:
                 from .exact_shading import ExactShading
 
-                self._exact = ExactShading(
-                    variant, surface, self._points.positions, use_stam=parameters.evaluator == "stam"
-                )
+                use_stam = parameters.evaluator == "stam"
+                self._exact = ExactShading(variant, surface, self._placement.positions, use_stam=use_stam)
             self._displacement: ShapeDisplacement | None = None
             if parameters.displacement is not None:
                 from .displacement import ShapeDisplacement
@@ -85,7 +83,7 @@ def make_subdivision(
                     self._displacement = ShapeDisplacement(
                         variant,
                         surface,
-                        self._points.positions,
+                        self._placement.positions,
                         parameters.displacement,
                         parameters.displacement_scale,
                         self._exact,
@@ -104,7 +102,7 @@ def make_subdivision(
                 self.control_points = dr.opaque(self.control_points)
             # From a list: with a NumPy array, the compiled kernel would depend on the alignment of its memory.
             self.to_world = variant.AffineTransform4f(parameters.to_world.tolist())
-            self._take_to_world(parameters.to_world)
+            self._placement.take(self.to_world, parameters.to_world)
             self._prepare(surface.cage.positions, parameters.to_world)
 
             super().__init__(
@@ -113,7 +111,7 @@ def make_subdivision(
                 face_count=0,
                 props=props,
                 has_vertex_normals=not (parameters.face_normals or is_exact),
-                has_vertex_texcoords=self._triangles.has_texcoords,
+                has_vertex_texcoords=self._mesh.has_texcoords,
             )
             if self._exact is not None:
                 from .interaction_hook import interaction_hook
@@ -141,13 +139,13 @@ def make_subdivision(
             if self._exact is not None:
                 self._exact.set_triangles(table, kept)
             self._cage.set_triangles(table, attributes)
-            self._triangles = Triangles(variant, table, attributes, kept)
-            self._vertices = MovingVertices(
+            self._mesh = MeshBuffers(
                 variant,
                 table,
                 attributes,
+                kept,
                 parameters,
-                self._points,
+                self._placement,
                 self._exact,
                 self._displacement,
                 on_backward_of(self.renew_derivatives),
@@ -161,8 +159,8 @@ def make_subdivision(
             # The kernels for the vertices run while the host prepares the triangles.
             dr.eval(buffers)
             self._has_turned_faces = self._placement.mirrors
-            faces = self._triangles.faces(are_turned=self._has_turned_faces)
-            buffers |= {"faces": faces, "face_element": self._triangles.element, **self._cage.buffers()}
+            faces = self._mesh.faces(are_turned=self._has_turned_faces)
+            buffers |= {"faces": faces, "face_element": self._mesh.element, **self._cage.buffers()}
             self._built = list(buffers)
             self._set_buffers(buffers)
             super().parameters_changed(self._built)
@@ -177,7 +175,7 @@ def make_subdivision(
             self._require_control_points()
             points = np.array(self.control_points, dtype=np.float64).reshape(-1, 3)
             to_world = checked_matrix(self.to_world)
-            self._take_to_world(to_world)
+            self._placement.take(self.to_world, to_world)
             self._prepare(points, to_world)
             self._assemble(moves_points=True)
 
@@ -191,7 +189,7 @@ def make_subdivision(
                     part.traverse(callback)
             if self._tessellation.limit is not None:
                 callback.put(self._tessellation.limit, self._error, flags.NonDifferentiable)
-            callback.put("patch_count", self._triangles.patch_count, flags.NonDifferentiable | flags.ReadOnly)
+            callback.put("patch_count", self._mesh.table.patch_count, flags.NonDifferentiable | flags.ReadOnly)
 
         @paused_collection()
         def parameters_changed(self, keys: list[str]) -> None:
@@ -211,7 +209,7 @@ def make_subdivision(
             if self._displacement is not None and scale is not None:
                 self._displacement.take_scale(scale)
             if "to_world" in keys:
-                self._take_to_world(to_world)
+                self._placement.take(self.to_world, to_world)
             if tessellation is not self._tessellation:
                 self._tessellation = tessellation
                 self.retessellate()
@@ -224,13 +222,13 @@ def make_subdivision(
                 self._has_turned_faces = self._placement.mirrors
                 self._has_outlines = False
             self._set_buffers(buffers)
-            is_attached = self._vertices.are_differentiable and dr.grad_enabled(buffers["vertex_positions"])
+            is_attached = self._mesh.are_differentiable and dr.grad_enabled(buffers["vertex_positions"])
             if is_attached and is_recording():
                 raise RuntimeError(
                     f"{self._parameters.source}: vertices with derivatives cannot be updated in a frozen function, as "
                     "Mitsuba reads a mesh's edges back; update them before, and freeze the picture and its gradients"
                 )
-            if is_attached and self._triangles.weld_target is not None:
+            if is_attached and self._mesh.weld_target is not None:
                 self._weld_outlines("faces" in keys)
                 keys = [key for key in keys if key != "faces"]
             # With the moved buffers among the keys, Mitsuba does not replace normals by averages of triangle normals.
@@ -273,28 +271,17 @@ def make_subdivision(
             with errors_about("control_points"):
                 require_control_points(self.control_points, self._parameters.surface.cage.vertex_count)
 
-        def _take_to_world(self, matrix: NDArray[np.float64] | None) -> None:
-            """Set the placement to ``to_world``, whose checked value is ``matrix``, or None if it cannot be read."""
-            centre = self._points.centre
-            if matrix is None:
-                self._placement = self._placement.recorded(self.to_world, centre)
-            else:
-                self._placement = Placement.of(self.to_world, matrix, centre)
-            if is_jit:
-                # Dr.Jit compiles literals into kernels.
-                dr.make_opaque(self.to_world, self._placement.matrix)
-
         def _tessellate(self, *, moves_points: bool) -> dict[str, FloatBuffer]:
             """Evaluate the moving buffers, and update exact shading."""
             with errors_about("control_points"):
-                return self._vertices.evaluated(self.control_points, self._placement, moves_points=moves_points)
+                return self._mesh.evaluated(self.control_points, moves_points=moves_points)
 
         def renew_derivatives(
             self,
             gradients: dict[str, FloatBuffer | Matrix4],  # Gradient by each array computed from the parameters
         ) -> None:
-            """Attach the moving arrays to the parameters again, without evaluating them; see `MovingVertices`."""
-            self._vertices.warn_of_lost(gradients, self.control_points, self._placement)
+            """Attach the moving arrays to the parameters again, without evaluating them; see `MeshBuffers`."""
+            self._mesh.warn_of_lost(gradients, self.control_points)
             if dr.grad_enabled([self._cage.values[name] for name in self._cage.moving]):
                 # `renew_attribute` receives the gradients next. Attaching vertices twice in one pass crashes Dr.Jit.
                 return
@@ -306,11 +293,11 @@ def make_subdivision(
             with dr.resume_grad():
                 self._cage.renew(name, gradient)
                 self._replace_gradients(self._cage.buffers([name]))
-                if self._vertices.are_differentiable and f"{PREFIX}{name}" in self._cage.moving:
+                if self._mesh.are_differentiable and f"{PREFIX}{name}" in self._cage.moving:
                     self._attach_vertices()
 
         def _attach_vertices(self) -> None:
-            self._replace_gradients(self._vertices.attached(self.control_points, self._placement))
+            self._replace_gradients(self._mesh.attached(self.control_points))
 
         def _replace_gradients(self, buffers: dict[str, FloatBuffer]) -> None:
             """Attach the mesh's buffers to the graphs of ``buffers``, unless a user has assigned them since."""
@@ -359,7 +346,7 @@ def make_subdivision(
             if self._has_outlines:
                 return
             faces = self._get_buffers("faces")["faces"]
-            self._set_buffers({"faces": dr.gather(type(faces), self._triangles.weld_target, faces)})
+            self._set_buffers({"faces": dr.gather(type(faces), self._mesh.weld_target, faces)})
             self.build_directed_edges()
             self._set_buffers({"faces": faces})
             self._has_outlines = True
@@ -449,7 +436,7 @@ def make_subdivision(
                 *self._tessellation.lines(),
                 f"shading = {'vertex' if self._exact is None else 'exact'}",
                 f"control_points = {dr.width(self.control_points) // 3}",
-                f"patch_count = {self._triangles.patch_count}",
+                f"patch_count = {self._mesh.table.patch_count}",
                 f"vertex_count = {self.vertex_count()}",
                 f"face_count = {self.face_count()}",
                 f"face_normals = {str(self.has_face_normals()).lower()}",

@@ -1,4 +1,4 @@
-"""Vertices of the shape's mesh, which follow control points and placement, and its triangles."""
+"""Buffers of the shape's mesh: vertices, which follow control points and placement, and triangles."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from ..device_arrays import mapped, take_over
 from ..kernels.array_types import ArrayTypes, FloatBuffer, IndexBuffer, LaterArrays, Matrix4
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared, SharedArray
-from ..surface import LimitSurface
+from ..surface import TEXCOORDS, LimitSurface
 from ..variants import Variant
 from .derivatives import Watched, computed_ones, warn_of_lost
 from .device_state import is_recording
-from .placement import Placement, RecentredPoints
+from .placement import Placement
 
 if TYPE_CHECKING:
     from ..kernels import EvaluatedVertices, VertexKernel
@@ -37,8 +37,8 @@ _LOADED: Shared[LaterArrays] = Shared()
 MOST_SHARED = 1 << 14
 
 
-class MovingVertices:
-    """Positions and normals of a shape in world space and its exact shading, for moving control points and placement.
+class MeshBuffers:
+    """Triangles of a shape, and positions and normals in world space, which also update exact shading and placement.
 
     Surfaces are evaluated in object space, relative to the centre of the loaded control points, and then mapped to
     world space. Arrays are Dr.Jit arrays, or NumPy arrays in scalar variants.
@@ -53,15 +53,21 @@ class MovingVertices:
         variant: Variant,
         table: VertexTable,
         attributes: AttributeTable,  # Vertices of the mesh, with or without copies along seams
+        kept: IntArray | None,  # (n,) int64: indices of the triangles of the mesh; None for all
         parameters: Parameters,
-        points: RecentredPoints,
+        placement: Placement,
         shading: ExactShading | None,
         displacement: ShapeDisplacement | None,
         # Called with the gradients of the moving arrays, by name, after each reverse-mode pass
         on_backward: Callable[[dict[str, FloatBuffer | Matrix4]], None],
     ) -> None:
-        self._table, self._parameters, self._points = table, parameters, points
-        self._shading, self._displacement, self._on_backward = shading, displacement, on_backward
+        self._variant, self._attributes, self._kept = variant, attributes, kept
+        self.table, self.layout, self._parameters = table, attributes.layout, parameters
+        self._placement, self._shading, self._displacement = placement, shading, displacement
+        self._on_backward = on_backward
+        self.has_texcoords = TEXCOORDS in attributes.values
+        # References that keep shared arrays alive.
+        self._held: dict[str, SharedArray] = {}
         is_jit = dr.is_jit_v(variant.Float)
         self._types = ArrayTypes(variant.Float) if is_jit else None
         self._is_sampled = parameters.evaluator != "stabilized" or parameters.sample_offset > 0
@@ -80,7 +86,7 @@ class MovingVertices:
             self._loaded = _LOADED.get((self._kernel, parameters.surface.cage), LaterArrays)
         # Index of each vertex of the mesh among those of the tessellation, if seams have copies. Copies are displaced
         # differently and averaged; with exact shading, only one of them is kept.
-        copied, kept, self._displaced = attributes.surface_vertex, None, None
+        copied, one_of_copies, self._displaced = attributes.surface_vertex, None, None
         if displacement is not None:
             from .displaced_vertices import displaced_vertices
 
@@ -96,47 +102,46 @@ class MovingVertices:
                 has_normals=has_normals,
             )
             if copied is None and split.surface_vertex is not None:
-                _, kept = np.unique(split.surface_vertex, return_index=True)
+                _, one_of_copies = np.unique(split.surface_vertex, return_index=True)
             copied = split.surface_vertex
-        self._copied, self._kept = self._index(copied), self._index(kept)
+        self._copied, self._one_of_copies = self._index(copied), self._index(one_of_copies)
 
     def evaluated(
         self,
         control_points: FloatBuffer,  # Parameter of the shape, in object space
-        placement: Placement,
         *,
         moves_points: bool,  # Whether control points have changed
     ) -> dict[str, FloatBuffer]:
         """Evaluate the mesh's buffers, and update exact shading. Returns the buffers by name."""
-        points, surface = self._points(control_points), self._surface
+        points, surface = self._placement.relative(control_points), self._surface
         if moves_points:
             self._loaded = None
         if surface is not None and moves_points:
             surface.set_control_points(points)
         elif surface is not None and self.are_differentiable and dr.grad_enabled(points):
             surface.values.attach(points)
-        sources = self._sources(control_points, placement)
+        sources = self._sources(control_points)
         moves = self.are_differentiable and dr.grad_enabled(*sources)
         self._computed = computed_ones(*sources) if moves else set()
         # Free the memory of the last evaluation before the next one.
         self._evaluated = None
         if self._kernel is None:
-            return self._placed(*self._on_host(points), points, placement)
+            return self._placed(*self._on_host(points), points)
         evaluate = partial(self._kernel.evaluated, dr.detach(points))
         evaluated: EvaluatedVertices = evaluate() if self._loaded is None else self._loaded.get(evaluate)
         # Shared vertices are kept for frozen functions; others for a displacement, as gradients of heights may be
         # enabled later.
         self._evaluated = evaluated if moves or self._displaced is not None or self._loaded is not None else None
-        return self._placed(*evaluated.attached(points), points, placement)
+        return self._placed(*evaluated.attached(points), points)
 
-    def attached(self, control_points: FloatBuffer, placement: Placement) -> dict[str, FloatBuffer]:
+    def attached(self, control_points: FloatBuffer) -> dict[str, FloatBuffer]:
         """Attach exact shading and the buffers of the last evaluation to the parameters again."""
-        points, surface = self._points(control_points), self._surface
+        points, surface = self._placement.relative(control_points), self._surface
         if surface is not None and dr.grad_enabled(points):
             surface.values.attach(points)
         if self._evaluated is None:
             raise RuntimeError("vertices were not kept; expected an evaluation with derivatives before")
-        return self._placed(*self._evaluated.attached(points), points, placement)
+        return self._placed(*self._evaluated.attached(points), points)
 
     def warn_of_lost(
         self,
@@ -144,10 +149,9 @@ class MovingVertices:
         # used.
         gradients: dict[str, FloatBuffer | Matrix4],
         control_points: FloatBuffer,
-        placement: Placement,
     ) -> None:
         """Warn if a gradient has reached the parameters, but not the variables that these were computed from."""
-        lost = self._computed - computed_ones(*self._sources(control_points, placement))
+        lost = self._computed - computed_ones(*self._sources(control_points))
         if lost and not is_recording() and any(dr.any(gradient != 0, axis=None) for gradient in gradients.values()):
             others = (
                 "control_points or to_world" if self._displacement is None else "control_points, to_world or heights"
@@ -161,10 +165,10 @@ class MovingVertices:
             return self._shading.kernel
         return None if self._displacement is None else self._displacement.kernel
 
-    def _sources(self, control_points: FloatBuffer, placement: Placement) -> list:
+    def _sources(self, control_points: FloatBuffer) -> list:
         """Arrays that vertices depend on."""
         heights = [] if self._displacement is None else self._displacement.variables()
-        return [control_points, placement.matrix, *heights]
+        return [control_points, self._placement.matrix, *heights]
 
     def _on_host(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """Evaluate positions and normals in NumPy.
@@ -172,15 +176,15 @@ class MovingVertices:
         Raises ValueError if the number of control points differs from that of the tessellation.
         """
         coordinates = np.array(dr.detach(points), dtype=np.float64)
-        _require_coordinates(coordinates.size, self._table.control_count)
+        _require_coordinates(coordinates.size, self.table.control_count)
         if not self._is_sampled:
-            positions, normals = self._table.apply(coordinates.reshape(-1, 3))
+            positions, normals = self.table.apply(coordinates.reshape(-1, 3))
             return positions.astype(np.float32).ravel(), normals.astype(np.float32).ravel()
         # Each vertex as a sample in float32, by the evaluator of the parameters, for comparison.
         given = self._parameters
         cage = given.surface.cage.with_positions(coordinates.reshape(-1, 3))
         surface, how = LimitSurface(cage, given.surface.scheme), (given.evaluator, np.float32, given.sample_offset)
-        p, n = surface.sample_vertices(self._table, *how)
+        p, n = surface.sample_vertices(self.table, *how)
         # The published forms may return NaN for the normal of parallel tangents; the kernel returns zero.
         n = np.nan_to_num(n)
         return (p.ravel(), n.ravel()) if self._types is None else (self._types.floats(p), self._types.floats(n))
@@ -196,18 +200,16 @@ class MovingVertices:
             return np.reshape(flat, (-1, 3))[index].ravel()
         return self._types.gathered(flat, index)
 
-    def _placed(
-        self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer, placement: Placement
-    ) -> dict[str, FloatBuffer]:
+    def _placed(self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer) -> dict[str, FloatBuffer]:
         """Copy, displace and place vertices, and update exact shading."""
+        placement, shading = self._placement, self._shading
         positions, normals = self._selected(positions, self._copied), self._selected(normals, self._copied)
         if self._displaced is not None:
             positions, normals = self._displaced(positions, normals, points)
-            positions, normals = self._selected(positions, self._kept), self._selected(normals, self._kept)
+            positions, normals = (self._selected(flat, self._one_of_copies) for flat in (positions, normals))
         if not placement.is_identity:
             positions, normals = placement.placed(positions, normals)
         moved = {"vertex_positions": positions, "vertex_normals": normals}
-        shading = self._shading
         if shading is not None:
             moved |= {"coefficients": shading.kernel.coefficients, "to_world": placement.matrix}
         if self.are_differentiable:
@@ -217,6 +219,42 @@ class MovingVertices:
         if shading is not None:
             shading.set_transform(moved.pop("to_world"), moved.pop("coefficients"), placement)
         return moved
+
+    def faces(self, *, are_turned: bool) -> IndexBuffer:
+        """Vertices of all triangles, flat; in reversed order if ``are_turned``."""
+
+        def make() -> NDArray:
+            triangles = self._of_kept(self.layout.triangles)
+            return triangles[:, [0, 2, 1]] if are_turned else triangles
+
+        return self._shared("faces", (self.layout, are_turned, Content(self._kept)), make, self._variant.UInt32)
+
+    @property
+    def element(self) -> FloatBuffer:
+        """Element of each triangle; a buffer of floats."""
+        key = self.table, Content(self._kept)
+        return self._shared("element", key, lambda: self._of_kept(self.table.element), self._variant.Float)
+
+    @property
+    def weld_target(self) -> IndexBuffer | None:
+        """See `split_weld_targets`; None if no vertex has copies."""
+        targets = partial(split_weld_targets, self.table, self._attributes)
+        return self._shared("weld_target", (self.table, self.layout), targets, self._variant.UInt32)
+
+    def _of_kept(self, of_triangles: NDArray) -> NDArray:
+        return of_triangles if self._kept is None else of_triangles[self._kept]
+
+    def _shared(
+        self, name: str, key: tuple, make: Callable[[], NDArray | None], kind: type
+    ) -> FloatBuffer | IndexBuffer:
+        def array() -> SharedArray:
+            values = make()
+            if values is None:
+                return SharedArray(None)
+            return SharedArray(mapped(kind, values) if dr.is_jit_v(kind) else values.ravel())
+
+        self._held[name] = _SHARED.get((name, self._variant, *key), array)
+        return self._held[name].array
 
 
 def require_control_points(control_points: FloatBuffer, count: int) -> None:
@@ -256,61 +294,3 @@ def split_weld_targets(table: VertexTable, attributes: AttributeTable) -> NDArra
     # In repeated assignments the last one counts, so assign in reverse order.
     first[target[::-1]] = vertices[::-1]
     return first[target]
-
-
-class Triangles:
-    """Triangles of a tessellation as Dr.Jit arrays, or as NumPy arrays in scalar variants."""
-
-    def __init__(
-        self,
-        variant: Variant,
-        table: VertexTable,
-        attributes: AttributeTable,  # Vertices of the mesh, with or without copies along seams
-        kept: IntArray | None,  # (n,) int64: indices of the triangles of the mesh; None for all
-    ) -> None:
-        self._variant = variant
-        self._kept = slice(None) if kept is None else kept
-        self._name = None if kept is None else Content(kept)
-        self.table, self.layout, self._attributes = table, attributes.layout, attributes
-        self.patch_count, self.has_texcoords = table.patch_count, "texcoords" in attributes.values
-        # References that keep shared arrays alive.
-        self._held: dict[str, SharedArray] = {}
-
-    def faces(self, *, are_turned: bool) -> IndexBuffer:
-        """Vertices of all triangles, flat; in reversed order if ``are_turned``."""
-
-        def make() -> NDArray:
-            triangles = self.layout.triangles[self._kept]
-            return triangles[:, [0, 2, 1]] if are_turned else triangles
-
-        return self._shared("faces", (self.layout, are_turned, self._name), make, self._variant.UInt32)
-
-    @property
-    def element(self) -> FloatBuffer:
-        """Element of each triangle; a buffer of floats."""
-
-        def make() -> NDArray:
-            return self.table.element[self._kept]
-
-        return self._shared("element", (self.table, self._name), make, self._variant.Float)
-
-    @property
-    def weld_target(self) -> IndexBuffer | None:
-        """See `split_weld_targets`; None if no vertex has copies."""
-
-        def make() -> NDArray | None:
-            return split_weld_targets(self.table, self._attributes)
-
-        return self._shared("weld_target", (self.table, self.layout), make, self._variant.UInt32)
-
-    def _shared(
-        self, name: str, key: tuple, make: Callable[[], NDArray | None], kind: type
-    ) -> FloatBuffer | IndexBuffer:
-        def array() -> SharedArray:
-            values = make()
-            if values is None:
-                return SharedArray(None)
-            return SharedArray(mapped(kind, values) if dr.is_jit_v(kind) else values.ravel())
-
-        self._held[name] = _SHARED.get((name, self._variant, *key), array)
-        return self._held[name].array
