@@ -339,21 +339,24 @@ class _StageWalk:
         if len(kinds) and not 0 <= kinds.min() <= kinds.max() < len(targets):
             expected = f"0 to {len(targets) - 1}, as there are {len(targets)} prototypes" if targets else "prototypes"
             raise CageError(f"{location}: protoIndices are from {kinds.min()} to {kinds.max()}; expected {expected}")
-        if not len(kinds) and instancer.GetPositionsAttr().Get(self._code):
-            self._notes.add("point instancers without protoIndices show nothing", path)
+        if not len(kinds):
+            if instancer.GetPositionsAttr().Get(self._code):
+                self._notes.add("point instancers without protoIndices show nothing", path)
+            return []
         primvars = UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues()
         if any(primvar.GetInterpolation() != "constant" for primvar in primvars):
             self._notes.add("primvars of point instancers are ignored", path)
         mask = instancer.ComputeMaskAtTime(self._code)
         time = self._time_of_instances(instancer)
+        for part in ("positions", "orientations", "orientationsf", "scales"):
+            attribute = prim.GetAttribute(part)
+            count = len((attribute and attribute.Get(time)) or ())
+            # USD itself reads beyond the end of what is too short.
+            if count != len(kinds) and (count or part == "positions"):
+                raise CageError(f"{location}: there are {count} {part}; expected {len(kinds)}, as many as protoIndices")
         transforms = instancer.ComputeInstanceTransformsAtTime(
             time, time, UsdGeom.PointInstancer.IncludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
         )
-        if len(transforms) != len(kinds):
-            raise CageError(
-                f"{location}: {len(kinds)} protoIndices, but {len(transforms)} transforms; expected as many positions, "
-                "orientations and scales"
-            )
         matrices = to_root @ np.array(transforms).reshape(-1, 4, 4).transpose(0, 2, 1)
         is_shown = np.array(mask, dtype=bool) if mask else np.ones(len(kinds), dtype=bool)
         is_usable = are_invertible(matrices)

@@ -225,6 +225,16 @@ BROKEN = [
 ]
 
 
+@pytest.mark.parametrize("name", ["positions", "orientations", "scales"])
+def test_instancers_with_too_few_values_say_how_many(tmp_path, name):
+    """USD reads beyond their end."""
+    short = INSTANCER[name].partition("), (")[0] + ")]"
+    text = prim("PointInstancer", "prim", *{**INSTANCER, name: short}.values(), prim("Mesh", "proto", CUBE))
+    entries, (message,) = told(scene_at, write(tmp_path, mesh_of(0, "") + text))
+    assert f"prim /prim: there are 1 {name}; expected 2, as many as protoIndices; the prim is left out" in message
+    assert not [entry for entry in entries if entry.startswith(("group", "prim"))]
+
+
 @pytest.mark.parametrize("text", BROKEN)
 def test_a_prim_that_cannot_be_used_is_told_and_the_stage_stays(tmp_path, text):
     entries, messages = told(scene_at, write(tmp_path, mesh_of(0, "") + text))
