@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import math
-import os
 import re
 import zipfile
 from collections.abc import Sequence
@@ -29,7 +28,7 @@ _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0
 # Of blocks of 8 by 8 pixels, one value.
 _MOST_SCALE = 8
 # Tile 1001 + u + 10 v lies at texture coordinates from (u, v) to (u + 1, v + 1).
-_FIRST_TILE, _TILES_IN_ROW, _TILE_ROWS = 1001, 10, 10
+_FIRST_TILE, _TILES_IN_ROW = 1001, 10
 
 # Integers up to this are decoded by a table.
 _TABULATED = 65535
@@ -66,43 +65,25 @@ def read_texture_image(
     """
     if UDIM not in path:
         return TextureImage(_pixels(path, color_space, needed, most), np.eye(3))
-    tiles = {tile: _pixels(name, color_space, needed, most) for tile, name in _tiles(path).items()}
-    if not tiles:
+    from pxr import UsdShade
+
+    files = UsdShade.UdimUtils.ResolveUdimTilePaths(path, None)
+    if not files:
         raise FileNotFoundError("there are no tiles")
-    return _joined(tiles)
+    pixels = [_pixels(name, color_space, needed, most) for name, _ in files]
+    v, u = np.divmod([int(tile) - _FIRST_TILE for _, tile in files], _TILES_IN_ROW)
+    return _joined(pixels, np.stack([u, v], axis=1))
 
 
-def _tiles(path: str) -> dict[tuple[int, int], str]:
-    """Paths of the existing tiles, by (u, v)."""
-    inside = _IN_ARCHIVE.match(path)
-    if inside:
-        with zipfile.ZipFile(inside[1]) as archive:
-            there = {name: f"{inside[1]}[{name}]" for name in archive.namelist()}
-        pattern = inside[2]
-    else:
-        folder, pattern = os.path.split(path)
-        there = {name: os.path.join(folder, name) for name in os.listdir(folder or ".")}
-    before, after = pattern.split(UDIM, 1)
-    is_tile = re.compile(f"{re.escape(before)}(\\d{{4}}){re.escape(after)}")
-    tiles = {}
-    for name, full in there.items():
-        match = is_tile.fullmatch(name)
-        v, u = divmod(int(match[1]) - _FIRST_TILE, _TILES_IN_ROW) if match else (-1, 0)
-        if 0 <= v < _TILE_ROWS:
-            tiles[u, v] = full
-    return tiles
-
-
-def _joined(tiles: dict[tuple[int, int], NDArray]) -> TextureImage:
-    """One image of all tiles; smaller ones are enlarged to the size of the largest."""
-    uv = np.array(list(tiles))
+def _joined(tiles: list[NDArray], uv: NDArray[np.int64]) -> TextureImage:
+    """One image of all tiles, at ``(n, 2)``; smaller ones are enlarged to the size of the largest."""
     first, (columns, rows) = uv.min(axis=0), np.ptp(uv, axis=0) + 1
-    height, width, channels = np.max([tile.shape for tile in tiles.values()], axis=0)
-    dtype = max((tile.dtype for tile in tiles.values()), key=lambda dtype: (dtype.kind == "f", dtype.itemsize))
+    height, width, channels = np.max([tile.shape for tile in tiles], axis=0)
+    dtype = max((tile.dtype for tile in tiles), key=lambda dtype: (dtype.kind == "f", dtype.itemsize))
     pixels = np.zeros((rows, height, columns, width, channels), dtype=dtype)
     is_there = np.zeros((rows, height, columns, width), dtype=bool)
-    for (u, v), of_file in tiles.items():
-        row, column = rows - 1 - (v - first[1]), u - first[0]
+    for (column, above), of_file in zip(uv - first, tiles, strict=True):
+        row = rows - 1 - above
         tile = of_file if of_file.shape[2] == channels else with_alpha(of_file)[..., :channels]
         if tile.shape[:2] != (height, width) or tile.dtype != dtype:
             values = _resampled(tile.astype(np.float32) / np.float32(_full(tile.dtype)), (height, width))
