@@ -64,6 +64,8 @@ class CageScenes:
         numbers: range | None = None,  # Times or numbers of files, if there are frames
     ) -> None:
         self.name = cage.source.name if isinstance(cage, ControlCage) else f'"{cage}"'
+        if isinstance(cage, ControlCage) and (prim is not None or time is not None):
+            raise CageError(f"{self.name}: prim or time was given; expected them for a file")
         self._cage, self._look = cage, look
         self._prim, self._time, self._scheme = prim, time, scheme
         self._size = look.size or DEFAULT_SIZE
@@ -79,7 +81,11 @@ class CageScenes:
     def at(self, number: int | None = None) -> PosedModel:
         """The cage of a frame; by default, of the file or in memory."""
         if number is None:
-            model = Model(self._cage, prim=self._prim, time=self._time, scheme=self._scheme)
+            if isinstance(self._cage, ControlCage):
+                model = Model(self._cage, scheme=self._scheme)
+            else:
+                path = Path(self._cage)
+                model = self._model_of(self._contents(path, self._time), path, self._time)
             return model, model.cage.positions
         if number not in self._offsets:
             return self._read(number)
@@ -89,8 +95,16 @@ class CageScenes:
             return self._model, kept
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", CageWarning)
-            model = self._model_of(number, kept)
+            model = self._model_of(kept, self._files.file(number), self._files.time(number))
         return model, model.cage.positions
+
+    def _contents(self, path: Path, time: float | None) -> CageContents:
+        return read_file(path, self._prim, time, {"scheme": self._scheme} if self._scheme else {})
+
+    def _model_of(self, contents: CageContents, path: Path, time: float | None) -> Model:
+        scheme = {"scheme": self._scheme} if self._scheme else {}
+        cage = ControlCage.from_arrays(**{**contents.as_arguments(), **scheme})
+        return Model(cage, path, prim=self._prim, time=time, scheme=self._scheme)
 
     def framing(self, contents: PosedModel) -> tuple[str, View, tuple[int, int]]:
         """Axis that points up, view and size of the picture."""
@@ -159,10 +173,10 @@ class CageScenes:
 
     def _read(self, number: int) -> PosedModel:
         """Read the file of a frame, and keep the data that differ from other frames."""
-        rules = {"scheme": self._scheme} if self._scheme else {}
+        path, time = self._files.file(number), self._files.time(number)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", CageWarning)
-            contents = read_file(self._files.file(number), self._prim, self._files.time(number), rules)
+            contents = self._contents(path, time)
         self._offsets[number] = self._kept.seek(0, 2)
         if self._first is not None and same_topology(contents, self._first):
             positions = np.asarray(contents.positions, dtype=np.float64)
@@ -171,17 +185,13 @@ class CageScenes:
         # Frames of the same topology have the same warnings.
         for warning in caught:
             warn(str(warning.message))
-        model = self._model_of(number, contents)
+        model = self._model_of(contents, path, time)
         if self._first is None:
             self._first, self._model = contents, model
             pickle.dump(model.cage.positions, self._kept)
         else:
             pickle.dump(contents, self._kept)
         return model, model.cage.positions
-
-    def _model_of(self, number: int, contents: CageContents) -> Model:
-        time = self._files.time(number)
-        return Model(self._files.file(number), prim=self._prim, time=time, scheme=self._scheme, contents=contents)
 
     def _shapes(self, model: Model, triangles: SceneNode | None = None, *, in_memory: bool = False) -> SceneNode:
         """Entries of the limit surface and of the drawn cage."""

@@ -11,8 +11,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage import CageError, ControlCage, named_cages
-from ..cage.contents import CageContents
+from ..cage import ControlCage, named_cages
 from ..cage.errors import CageSource, shortened, warn
 from ..files.formats import FORMATS
 from ..surface import LimitSurface
@@ -40,32 +39,16 @@ def frame_table(surface: LimitSurface) -> VertexTable:
 
 
 class Model:
-    """A cage and its limit surface. Raises what `ControlCage.from_file` and `LimitSurface` raise."""
+    """A cage and its limit surface, and the file that the cage is from."""
 
     def __init__(
         self,
-        cage: ControlCage | str | Path,  # A cage, or the file of one
-        *,
-        # As for `ControlCage.from_file`
-        prim: str | None = None,
-        time: float | None = None,
-        scheme: str | None = None,
-        contents: CageContents | None = None,  # What the file holds, if it has been read
+        cage: ControlCage,
+        path: Path | None = None,  # Its file; None for a cage in memory
+        **chosen: Any,  # What of the file: `prim`, `time` and `scheme` as for `ControlCage.from_file`
     ) -> None:
-        self._chosen = {"prim": prim, "time": time, "scheme": scheme}
-        if isinstance(cage, ControlCage):
-            if prim is not None or time is not None:
-                raise CageError(f"{cage.source.name}: prim or time was given; expected them for a file")
-            self.path = None
-            self.surface = LimitSurface(cage, scheme)
-            return
-        self.path = Path(cage)
-        rules: dict[str, Any] = {"scheme": scheme} if scheme else {}
-        if contents is None:
-            read = ControlCage.from_file(cage, prim=prim, time=time, **rules)
-        else:
-            read = ControlCage.from_arrays(**{**contents.as_arguments(), **rules})
-        self.surface = LimitSurface(read)
+        self.path, self._chosen = path, {name: value for name, value in chosen.items() if value is not None}
+        self.surface = LimitSurface(cage, self._chosen.get("scheme"))
 
     @cached_property
     def materials(self) -> dict[str, Material]:
@@ -146,12 +129,12 @@ class Model:
         in_memory: bool = False,  # Whether the shape gets the cage itself, rather than its file
     ) -> SceneNode:
         """The shape ``subdivision`` as an entry of a scene, without a material."""
-        given = {name: value for name, value in self._chosen.items() if value is not None}
         if in_memory or self.path is None:
             # What `prim` and `time` have chosen is in the cage itself.
-            cage = self.cage.as_properties(mi) | {name: given[name] for name in given if name == "scheme"}
+            scheme = {name: value for name, value in self._chosen.items() if name == "scheme"}
+            cage = self.cage.as_properties(mi) | scheme
         else:
-            cage = {"filename": str(self.path.resolve()), **given}
+            cage = {"filename": str(self.path.resolve()), **self._chosen}
         shown = {} if shading == "vertex" else {"shading": shading}
         return {"type": "subdivision", **cage, **triangles, **shown}
 
