@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from ..kernels import EvaluatedVertices, VertexKernel
     from ..kernels.surface_kernel import SurfaceKernel
     from ..tessellation import AttributeTable, VertexTable
+    from .displaced_vertices import DisplacedVertices
     from .displacement import ShapeDisplacement
     from .exact_shading import ExactShading
     from .parameters import Parameters
@@ -86,12 +87,13 @@ class MeshBuffers:
             self._loaded = _LOADED.get((self._kernel, parameters.surface.cage), LaterArrays)
         # Index of each vertex of the mesh among those of the tessellation, if seams have copies. Copies are displaced
         # differently and averaged; with exact shading, only one of them is kept.
-        copied, one_of_copies, self._displaced = attributes.surface_vertex, None, None
+        copied, one_of_copies = attributes.surface_vertex, None
+        self._displaced: DisplacedVertices | None = None
         if displacement is not None:
-            from .displaced_vertices import displaced_vertices
+            from .displaced_vertices import DisplacedOnDevice, DisplacedVertices
 
             split = parameters.surface.attribute_table(table)
-            has_normals = shading is None and not parameters.face_normals
+            displaced_vertices = DisplacedVertices if self._types is None else DisplacedOnDevice
             self._displaced = displaced_vertices(
                 table,
                 split,
@@ -99,7 +101,7 @@ class MeshBuffers:
                 parameters.surface,
                 displacement,
                 self._types,
-                has_normals=has_normals,
+                has_normals=shading is None and not parameters.face_normals,
             )
             if copied is None and split.surface_vertex is not None:
                 _, one_of_copies = np.unique(split.surface_vertex, return_index=True)
