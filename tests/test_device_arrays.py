@@ -30,9 +30,9 @@ NUMPY = re.compile(r"\bnp\.|\.(ravel|astype|reshape|copy)\(|\.(T|positions|value
 def test_tensors_have_the_values_and_the_shape(shape, np_rng):
     for name in ("TensorXf", "TensorXu"):
         values = np_rng.integers(0, 100, shape)
-        found = upload(getattr(mi, name), values)
-        assert type(found) is getattr(mi, name)
-        np.testing.assert_array_equal(np.array(found), values)
+        array = upload(getattr(mi, name), values)
+        assert type(array) is getattr(mi, name)
+        np.testing.assert_array_equal(np.array(array), values)
 
 
 @pytest.mark.core
@@ -56,15 +56,15 @@ def address(array):
 
 def test_memory_is_not_that_of_numpy(variant_llvm_ad_rgb):  # noqa: ARG001
     values = np.arange(20, dtype=np.float32)
-    found = upload(mi.Float, values)
-    assert address(found) != values.ctypes.data
+    array = upload(mi.Float, values)
+    assert address(array) != values.ctypes.data
     # For packets of any size.
-    assert address(found) % CACHE_LINE == 0
+    assert address(array) % CACHE_LINE == 0
     table = mapped(mi.Float, values)
-    assert address(table) not in (values.ctypes.data, address(found))
+    assert address(table) not in (values.ctypes.data, address(array))
     assert address(table) % CACHE_LINE == 0
     values[:] = 7
-    for copy in (found, table):
+    for copy in (array, table):
         np.testing.assert_array_equal(np.array(copy), np.arange(20))
 
 
@@ -78,8 +78,8 @@ def test_what_is_uploaded_is_there_for_other_threads(variant_llvm_ad_rgb):  # no
             for _ in range(20):
                 busy = dr.sin(busy)
             dr.eval(busy)
-            found = upload(mi.Float, values)
-            assert np.array_equal(pool.submit(found.numpy).result(), values)
+            array = upload(mi.Float, values)
+            assert np.array_equal(pool.submit(array.numpy).result(), values)
 
 
 def test_a_user_s_array_is_taken_over_in_place_unless_it_has_derivatives(variant_llvm_ad_rgb):  # noqa: ARG001
@@ -117,9 +117,9 @@ def converts(call):
 @pytest.mark.core
 def test_no_other_module_converts():
     """Numbers, and arrays of Dr.Jit, may be converted anywhere."""
-    found = []
+    conversions = []
     for module in ROOT.rglob("*.py"):
         calls = (node for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))) if isinstance(node, ast.Call))
-        found += [(module.relative_to(ROOT), ast.unparse(call)) for call in calls if converts(call)]
-    assert [path for path, _ in found if path.name != "device_arrays.py"] == [], found
+        conversions += [(module.relative_to(ROOT), ast.unparse(call)) for call in calls if converts(call)]
+    assert [path for path, _ in conversions if path.name != "device_arrays.py"] == [], conversions
     assert converts(ast.parse("mi.Float(points.ravel())").body[0].value)

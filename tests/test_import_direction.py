@@ -42,12 +42,12 @@ def allowed_imports():
     """What each package, or module beside the packages, may import of this project."""
     text = " ".join(read(ARCHITECTURE).split())
     numpy_packages = words_in(text.partition('"numpy packages" are, in this order, ')[2].partition(";")[0])
-    found = {}
+    allowed = {}
     for cell, _, stated in rows_below(ARCHITECTURE, "packages"):
         (package,) = words_in(cell)
         above = numpy_packages[: numpy_packages.index(package)] if "above" in stated else numpy_packages
-        found[package] = {*words_in(stated), *(above if "numpy packages" in stated else ())}
-    return found
+        allowed[package] = {*words_in(stated), *(above if "numpy packages" in stated else ())}
+    return allowed
 
 
 ALLOWED = allowed_imports()
@@ -81,12 +81,12 @@ def test_imports_go_one_way_but_for_those_that_go_up(graph):
     assert {package_of(module) for module in graph.modules if module.split(".")[0] == PACKAGE} == set(ALLOWED)
     wrong, used = [], set()
     for module, imported in imports_of(graph, PACKAGE):
-        own, library = package_of(module), imported.split(".")[0]
+        package, library = package_of(module), imported.split(".")[0]
         if library != PACKAGE:
-            wrong += [(module, imported)] if own not in MAY_IMPORT.get(library, {own}) else []
+            wrong += [(module, imported)] if package not in MAY_IMPORT.get(library, {package}) else []
         elif goes_up(module, imported):
             used |= {(source, target) for source, target in UP if source == module and imported.startswith(target)}
-        elif package_of(imported) not in {own, *ALLOWED[own]}:
+        elif package_of(imported) not in {package, *ALLOWED[package]}:
             wrong.append((module, imported))
     assert wrong == []
     assert used == UP
@@ -110,8 +110,8 @@ def test_modules_do_not_import_in_circles(graph, root):
     matrix = sparse.csr_array((np.ones(len(edges)), np.array(edges).T), shape=(len(modules),) * 2)
     _, label = sparse.csgraph.connected_components(matrix, connection="strong")
     is_in_circle = np.bincount(label)[label] > 1
-    found = [module for module, is_found in zip(modules, is_in_circle, strict=True) if is_found]
-    assert [module for module in found if not module.startswith(KNOWN_CIRCLES)] == []
+    in_circles = [module for module, is_one in zip(modules, is_in_circle, strict=True) if is_one]
+    assert [module for module in in_circles if not module.startswith(KNOWN_CIRCLES)] == []
 
 
 def test_whole_usd_files_are_built_on_public_names():
@@ -120,10 +120,12 @@ def test_whole_usd_files_are_built_on_public_names():
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and not node.level:
                 wrong += [
-                    (path.name, node.module, each.name) for each in node.names if not is_public(node.module, each.name)
+                    (path.name, node.module, alias.name)
+                    for alias in node.names
+                    if not is_public(node.module, alias.name)
                 ]
             elif isinstance(node, ast.Import):
-                wrong += [(path.name, each.name) for each in node.names if not is_public(each.name)]
+                wrong += [(path.name, alias.name) for alias in node.names if not is_public(alias.name)]
     assert wrong == []
 
 

@@ -109,8 +109,8 @@ def test_without_the_wheel_nothing_is_imported_to_look_for_it(fresh):
     hide = HIDE.replace("import importlib.metadata, ", "import ")
     hide = hide.replace("llvm._wheel_libraries = lambda: []", "llvm._WHEEL = 'no-such-wheel'")
     code = f"import sys; sys.modules['importlib.metadata'] = None\n{hide}llvm.select_llvm()"
-    found = run(code, SYSTEM_FOLDER=str(fresh[1]))
-    assert found.returncode == 0, found.stderr
+    done = run(code, SYSTEM_FOLDER=str(fresh[1]))
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_folder_with_a_star_stands_for_all_whose_names_begin_so(tmp_path):
@@ -118,8 +118,8 @@ def test_a_folder_with_a_star_stands_for_all_whose_names_begin_so(tmp_path):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / f"libLLVM-{version}.so").touch()
     (tmp_path / "llvm-18/lib/libLLVM-folder.so").mkdir()
-    found = llvm._libraries([f"{tmp_path}/llvm-*/lib", f"{tmp_path}/none*/lib", f"{tmp_path}/none"])
-    assert sorted(found) == [str(tmp_path / f"llvm-{version}/lib/libLLVM-{version}.so") for version in (18, 19)]
+    libraries = llvm._libraries([f"{tmp_path}/llvm-*/lib", f"{tmp_path}/none*/lib", f"{tmp_path}/none"])
+    assert sorted(libraries) == [str(tmp_path / f"llvm-{version}/lib/libLLVM-{version}.so") for version in (18, 19)]
 
 
 def test_the_newest_of_the_system_is_chosen_and_no_file_that_is_no_library(fresh):

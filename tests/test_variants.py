@@ -47,13 +47,15 @@ def test_these_are_all_public_functions_that_ask_for_mitsuba():
         public = getattr(msub, name)
         members = {name: public}
         if inspect.isclass(public):
-            members = {f"{name}.{own}": each for own, each in vars(public).items() if not own.startswith("_")}
-        for own, each in members.items():
-            function = getattr(each, "__func__", each)
+            members = {
+                f"{name}.{member}": value for member, value in vars(public).items() if not member.startswith("_")
+            }
+        for member, value in members.items():
+            function = getattr(value, "__func__", value)
             if not inspect.isfunction(function):
                 continue
             if {"mi", "variant", "float_type"} & {*inspect.signature(function).parameters}:
-                result.add(own)
+                result.add(member)
     assert result == {*FUNCTIONS}
 
 

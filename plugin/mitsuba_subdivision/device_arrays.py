@@ -45,12 +45,12 @@ def upload(kind: type, *parts: ArrayLike) -> Any:
     RuntimeError
         If Dr.Jit has loaded an LLVM library whose kernels end the process.
     """
-    found = mapped(kind, *parts)
+    array = mapped(kind, *parts)
     if dr.is_jit_v(kind):
-        found = dr.opaque(found)
+        array = dr.opaque(array)
         # Another thread, such as one that loads a shape of this tensor, would not wait for the copy.
         dr.sync_thread()
-    return found
+    return array
 
 
 def mapped(kind: type, *parts: ArrayLike) -> Any:

@@ -92,9 +92,9 @@ def library_version(path: str | Path) -> int | None:
     resolved = os.path.realpath(path)
     folder = os.path.dirname(resolved)
     for name in (os.path.basename(resolved), os.path.basename(path), folder, os.path.dirname(folder)):
-        found = re.search(r"LLVM-(\d+)|LLVM\.(?:so|dylib)\.(\d+)|llvm(?:-|/)(\d+)", name)
-        if found:
-            return int(next(group for group in found.groups() if group))
+        match = re.search(r"LLVM-(\d+)|LLVM\.(?:so|dylib)\.(\d+)|llvm(?:-|/)(\d+)", name)
+        if match:
+            return int(next(group for group in match.groups() if group))
     return None
 
 
@@ -111,8 +111,8 @@ def llvm_problem() -> str | None:
     if version is None:
         if choice.path:
             return f'Dr.Jit could not use "{choice.path}" ({choice.reason}): {INSTALL_HINT}'
-        found = f" but LLVM {choice.version}, which would abort the process" if choice.version else ""
-        return f"Dr.Jit has no LLVM library{found}: {INSTALL_HINT}"
+        loaded = f" but LLVM {choice.version}, which would abort the process" if choice.version else ""
+        return f"Dr.Jit has no LLVM library{loaded}: {INSTALL_HINT}"
     if version >= lowest:
         return None
     why = f"Dr.Jit has loaded LLVM {version}, which aborts the process, and needs {lowest} or newer"

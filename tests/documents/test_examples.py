@@ -120,14 +120,14 @@ class Block(NamedTuple):
 
 def blocks(page):
     text = page.read_text(encoding="utf-8")
-    found = []
+    result = []
     for match in BLOCK.finditer(text):
         line, mark = text.count("\n", 0, match.start("text")) + 1, match["mark"] or ""
-        found.append(Block(page, line, mark, match["language"], textwrap.dedent(match["text"])))
-    assert [block.mark for block in found if not MARK.fullmatch(block.mark)] == []
+        result.append(Block(page, line, mark, match["language"], textwrap.dedent(match["text"])))
+    assert [block.mark for block in result if not MARK.fullmatch(block.mark)] == []
     # None was missed.
-    assert 2 * len(found) == len(re.findall(r"^ *```", text, flags=re.MULTILINE))
-    return found
+    assert 2 * len(result) == len(re.findall(r"^ *```", text, flags=re.MULTILINE))
+    return result
 
 
 @pytest.fixture
@@ -284,9 +284,9 @@ def test_every_example_of_a_page_runs(page, folder):
 
 
 def test_pages_have_blocks_of_every_kind():
-    found = [block for page in PAGES for block in blocks(page)]
-    assert {block.language for block in found} == {"python", "sh", "xml", "bibtex"}
-    commands = [words for block in found if block.language == "sh" for words in block.commands]
+    every_block = [block for page in PAGES for block in blocks(page)]
+    assert {block.language for block in every_block} == {"python", "sh", "xml", "bibtex"}
+    commands = [words for block in every_block if block.language == "sh" for words in block.commands]
     assert len(commands) > 25
     ours = {words[1] for words in commands if words[0] == OURS}
     assert ours == {"compare", "doctor", "figure", "info", "merge", "render", "tessellate"}
@@ -328,9 +328,9 @@ def test_every_picture_of_a_page_is_there_and_every_option_in_its_text_is_one(pa
 def test_the_tables_of_parameters_are_those_of_the_shape(mark, parameters):
     lines = ["| Parameter | Type | Description | Flags |", "|---|---|---|---|"]
     signs = {"exposed": "P", "readonly": "R", "differentiable": "∂", "discontinuous": "D"}
-    for each in parameters:
-        flags = " ".join(signs[flag] for flag in each.flags)
-        lines.append(f"| `{each.name}` | {each.type} | {each.text.replace('``', '`')} | {flags} |")
+    for parameter in parameters:
+        flags = " ".join(signs[flag] for flag in parameter.flags)
+        lines.append(f"| `{parameter.name}` | {parameter.type} | {parameter.text.replace('``', '`')} | {flags} |")
     expected = "\n".join(lines).replace("|  |", "| |")
     page = (GUIDE / "parameters.md").read_text(encoding="utf-8")
     assert f"<!-- {mark} -->\n{expected}\n\n" in page, f"expected in the page below <!-- {mark} -->:\n{expected}"
@@ -356,11 +356,11 @@ def test_statements_of_the_table_of_tags_mean_what_it_says(tmp_path):
             rule, *values = quoted(meaning)
             assert contents(*statements).rules[rule] == values[-1]
             assert set(RULES[rule]) <= set(values)
-    found = contents(*statements)
-    assert found.creases.tolist() == [[0, 1, 3.5]]
-    assert found.corners.tolist() == [[7, 10]]
-    assert found.holes.tolist() == [5]
-    assert found.rules.keys() == RULES.keys()
+    cage = contents(*statements)
+    assert cage.creases.tolist() == [[0, 1, 3.5]]
+    assert cage.corners.tolist() == [[7, 10]]
+    assert cage.holes.tolist() == [5]
+    assert cage.rules.keys() == RULES.keys()
 
 
 def test_the_tables_of_tiers_and_of_figures_have_all_and_their_formats_and_options():

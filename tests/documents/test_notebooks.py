@@ -45,9 +45,11 @@ def test_there_are_three():
 def test_a_notebook_runs_and_shows_what_is_stored(path):
     """With fewer samples and steps. What these change, or the processor by its rounding, is marked as "varies"."""
     stored = nbformat.read(path, as_version=4)
-    found = executed(nbformat.read(path, as_version=4), quick=True)
-    for before, now in zip(code_cells(stored), code_cells(found), strict=True):
-        assert [has_picture(each) for each in now.outputs] == [has_picture(each) for each in before.outputs], now.id
+    run = executed(nbformat.read(path, as_version=4), quick=True)
+    for before, now in zip(code_cells(stored), code_cells(run), strict=True):
+        assert [has_picture(output) for output in now.outputs] == [has_picture(output) for output in before.outputs], (
+            now.id
+        )
         if not before.metadata.get("tests", {}).get("varies"):
             assert printed(now) == printed(before), now.id
             pairs = zip(now.outputs, before.outputs, strict=True)

@@ -37,7 +37,7 @@ def is_path(word):
 def citations(text):
     """Keys of the sources that a text cites."""
     flat = re.sub(r"\s*\n\s*#?\s*", " ", text)
-    keys = (KEY.match(part.strip()) for found in CITATION.findall(flat) for part in found.split(";"))
+    keys = (KEY.match(part.strip()) for citation in CITATION.findall(flat) for part in citation.split(";"))
     return {key.group() for key in keys if key}
 
 

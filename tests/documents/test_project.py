@@ -27,8 +27,8 @@ def classified(topic):
 
 def requirement(package, extra=None):
     lines = PROJECT["dependencies"] if extra is None else PROJECT["optional-dependencies"][extra]
-    (found,) = (line.removeprefix(package) for line in lines if line.startswith(package))
-    return found
+    (line,) = (line.removeprefix(package) for line in lines if line.startswith(package))
+    return line
 
 
 @pytest.mark.parametrize("job", ["tests", "try-packages"])
@@ -113,10 +113,10 @@ def targets(text):
 def test_links_of_the_long_description_work_on_a_package_index(long_description, repository):
     readme = read("README.md")
     text = long_description(readme, repository, "v1.2.3")
-    found = targets(text)
-    assert found
-    assert [target for target in found if not target.startswith("https://")] == []
-    paths = set(re.findall(rf"^{REPOSITORY}/(?:blob|raw)/v1\.2\.3/([^#\n]+)", "\n".join(found), flags=re.MULTILINE))
+    links = targets(text)
+    assert links
+    assert [target for target in links if not target.startswith("https://")] == []
+    paths = set(re.findall(rf"^{REPOSITORY}/(?:blob|raw)/v1\.2\.3/([^#\n]+)", "\n".join(links), flags=re.MULTILINE))
     relative = {target.partition("#")[0] for target in targets(readme) if not target.startswith("https:")}
     assert paths == (relative if repository else set())
     # All else is as it was.

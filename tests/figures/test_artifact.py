@@ -46,8 +46,8 @@ def test_stam_darkens_the_disc_and_the_stabilised_form_does_not(valence, variant
     stam, _ = disc_luminance(valence, evaluator="stam", sample_offset=offset)
     assert stam < DARKENED * expected
     for parameters in ({"evaluator": "stabilized", "sample_offset": offset}, {}):
-        result, own_error = disc_luminance(valence, **parameters)
-        assert abs(result - expected) < SIGMAS * np.hypot(error, own_error) + INTERPOLATION * expected
+        result, its_error = disc_luminance(valence, **parameters)
+        assert abs(result - expected) < SIGMAS * np.hypot(error, its_error) + INTERPOLATION * expected
 
 
 def test_the_artefact_comes_from_the_offset_of_the_cage_and_one_rule_of_three_has_it():

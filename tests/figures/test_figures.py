@@ -132,7 +132,7 @@ def test_a_figure_draws_without_warnings_fit_for_print(name, options):
 
 
 @pytest.fixture
-def own_cage(tmp_path):
+def users_cage(tmp_path):
     """A bent box with two creases, far from the origin and not of the size of any figure."""
     positions = 30 * cube().positions * [1, 0.7, 1.5] + [50, -20, 10] + np.random.default_rng(3).normal(size=(8, 3))
     faces = cube().face_vertices.reshape(-1, 4)
@@ -141,26 +141,26 @@ def own_cage(tmp_path):
     return tmp_path / "own.obj"
 
 
-def test_cages_around_a_vertex_have_it_first_and_where_it_is_asked_for(own_cage):
+def test_cages_around_a_vertex_have_it_first_and_where_it_is_asked_for(users_cage):
     like = frame(LimitSurface(extraordinary(5)))
-    ((valence, cage),) = around_vertices(own_cage, 3, like).items()
+    ((valence, cage),) = around_vertices(users_cage, 3, like).items()
     assert valence == 3 == cage.topology.vertex_face_count[0]
     assert cage.face_vertices.reshape(-1, 4)[:valence, 0].tolist() == [0] * valence
     assert len(cage.holes) < cage.face_count
     for result, expected in zip(frame(LimitSurface(cage)), like, strict=True):
         np.testing.assert_allclose(result, expected, atol=1e-9)
     # The same surface, but for where it lies: ratios of distances stay.
-    original = ControlCage.from_file(own_cage)
+    original = ControlCage.from_file(users_cage)
     while original.face_count < cage.face_count:
         original = original.refined()
-    spread = [np.linalg.norm(each.positions - each.positions.mean(axis=0), axis=1) for each in (original, cage)]
-    np.testing.assert_allclose(*(np.sort(each / each.max()) for each in spread), rtol=1e-9)
+    spread = [np.linalg.norm(cage.positions - cage.positions.mean(axis=0), axis=1) for cage in (original, cage)]
+    np.testing.assert_allclose(*(np.sort(values / values.max()) for values in spread), rtol=1e-9)
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse")
 @pytest.mark.parametrize("name", ["artifact", "error", "creases", "subdivision", "curvature", "zebra"])
-def test_figures_take_cages_of_users(name, options, own_cage):
-    (path,) = FIGURES[name](options(formats=("png",), cage=own_cage))
+def test_figures_take_cages_of_users(name, options, users_cage):
+    (path,) = FIGURES[name](options(formats=("png",), cage=users_cage))
     first = path.read_bytes()
     FIGURES[name](options(formats=("png",)))
     assert path.read_bytes() != first
@@ -235,13 +235,13 @@ def test_other_programs_are_drawn_only_where_they_are(options):
 
 def test_each_panel_of_creases_has_tags_of_its_own():
     cage = ControlCage.from_file(example_file("cages/rook.obj"))
-    smooth, own, infinite = (_tagged(cage, name).tags.edges for name in TITLES)
+    smooth, tagged, infinite = (_tagged(cage, name).tags.edges for name in TITLES)
     assert not smooth.any()
-    assert own is cage.tags.edges
-    assert np.array_equal(infinite, np.where(own > 0, INFINITE, 0))
+    assert tagged is cage.tags.edges
+    assert np.array_equal(infinite, np.where(tagged > 0, INFINITE, 0))
     # The legend tells every sharpness there is.
-    assert set(own[own > 0]) == {1.2, 1.5, 2, 3, 4, 10}
-    assert list(labels(own).values()) == ["1.2\u20132", "3\u20134", "∞"]
+    assert set(tagged[tagged > 0]) == {1.2, 1.5, 2, 3, 4, 10}
+    assert list(labels(tagged).values()) == ["1.2\u20132", "3\u20134", "∞"]
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")

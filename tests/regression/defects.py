@@ -71,8 +71,8 @@ class OtherVertexRule(CatmullClark):
     one_neighbour: bool
 
     def refine(self, topology):
-        found = super().refine(topology)
-        matrix = found.stencils.matrix.tolil()
+        refinement = super().refine(topology)
+        matrix = refinement.stencils.matrix.tolil()
         for vertex in np.flatnonzero(~topology.is_border_vertex & (topology.vertex_face_count != 4)):
             if vertex >= topology.vertex_count:
                 continue
@@ -81,7 +81,7 @@ class OtherVertexRule(CatmullClark):
             matrix[vertex, vertex] += 1e-3
             for column in others:
                 matrix[vertex, column] -= 1e-3 / len(others)
-        return found._replace(stencils=StencilTable.from_matrix(matrix))
+        return refinement._replace(stencils=StencilTable.from_matrix(matrix))
 
 
 def wrong_rule(valence, *, one_neighbour):

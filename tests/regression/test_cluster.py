@@ -29,7 +29,7 @@ def test_two_workers_give_the_bits_of_one_machine(variant_llvm_ad_rgb, address):
     alone = merge_passes([render_pass(loaded, SAMPLING, i + 1, PASSES, with_probe=True) for i in range(PASSES)])
     together = render_on_cluster(address, load, variant_llvm_ad_rgb, SAMPLING, PASSES, with_probe=True)
     result, expected = (
-        (each.pixels, each.estimate.variance, each.paired, each.probe.position) for each in (together, alone)
+        (image.pixels, image.estimate.variance, image.paired, image.probe.position) for image in (together, alone)
     )
     assert all(map(np.array_equal, result, expected))
 

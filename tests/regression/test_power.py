@@ -59,7 +59,7 @@ def test_the_tile_tier_is_sure_of_one_per_cent_and_of_nothing(reference, valence
     """At the usual 256 samples."""
     scene = load(valence)
     result = [compare(reference, render_like(reference, scene, seed=seed), ["tile"]) for seed in range(seeds)]
-    assert [str(each) for each in result if each.status is not status] == []
+    assert [str(comparison) for comparison in result if comparison.status is not status] == []
 
 
 @pytest.mark.parametrize("valence", [5], indirect=True)

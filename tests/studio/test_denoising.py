@@ -30,7 +30,7 @@ def test_denoising_removes_noise(model):
     result = render_denoised(scene, 8, 2)
     assert result.shape == expected.shape
     np.testing.assert_array_equal(result[..., 3:], noisy[..., 3:])
-    error, before = (np.sqrt(np.mean((each - expected)[..., :3] ** 2)) for each in (result, noisy))
+    error, before = (np.sqrt(np.mean((image - expected)[..., :3] ** 2)) for image in (result, noisy))
     assert error < LEFT * before
 
 

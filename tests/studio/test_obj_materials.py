@@ -40,7 +40,7 @@ def file(tmp_path):
 def test_each_material_is_a_shape_with_its_bsdf(file):
     with pytest.warns(CageWarning) as record:
         scene = studio_scene(file, **SMALL)
-    assert [str(each.message).partition(": ")[2] for each in record] == [
+    assert [str(warning.message).partition(": ")[2] for warning in record] == [
         "map_Bump left out; expected Kd, map_Kd (with -s, -o, -mm, -clamp, -blendu and -blendv), Ks, Ns, Ke, d, Tr, "
         "illum, Pr and Pm",
         f'there is no picture "{file.parent / "missing.png"}"; its colour is Kd',
@@ -145,13 +145,13 @@ def test_a_changed_picture_is_saved_with_its_scene(tmp_path, texture):
     (tmp_path / "cube.obj").write_text("mtllib a.mtl\n" + (tmp_path / "cube.obj").read_text())
     scene = studio_scene(tmp_path / "cube.obj", size=(16, 12), spp=16, rate=2, shading="vertex")
     save_scene(scene, tmp_path / "saved.xml")
-    result = [mi.traverse(each) for each in (mi.load_dict(scene), mi.load_file(str(tmp_path / "saved.xml")))]
+    result = [mi.traverse(loaded) for loaded in (mi.load_dict(scene), mi.load_file(str(tmp_path / "saved.xml")))]
     for name in ("data", "to_uv"):
-        values = [each for parameters in result for key, each in parameters if key.endswith(f"base_color.{name}")]
-        one, other = (np.array(getattr(each, "matrix", each)) for each in values)
+        values = [value for parameters in result for key, value in parameters if key.endswith(f"base_color.{name}")]
+        one, other = (np.array(getattr(value, "matrix", value)) for value in values)
         np.testing.assert_allclose(other, one, atol=1e-3)
     # 0.5 + 0.25 c, in half floats.
-    data = np.sort(np.array(next(each for key, each in result[1] if key.endswith("base_color.data"))), axis=None)
+    data = np.sort(np.array(next(value for key, value in result[1] if key.endswith("base_color.data"))), axis=None)
     assert data[[0, -1]] == pytest.approx([0.5, 0.75], abs=1e-3)
 
 
@@ -164,4 +164,4 @@ def test_statements_name_several_libraries_or_one_with_spaces(tmp_path):
         "mtllib\tfirst lib.mtl b.mtl  c d.MTL # three\n",
     ):
         (tmp_path / "a.obj").write_text(statements)
-        assert {name: each["Kd"][0] for name, each in read_materials(tmp_path / "a.obj").items()} == expected
+        assert {name: material["Kd"][0] for name, material in read_materials(tmp_path / "a.obj").items()} == expected

@@ -184,8 +184,8 @@ def test_times_of_a_usd_file_are_frames(folder):
     (folder / "m.usda").write_text(f'#usda 1.0\ndef Mesh "m" {{\n{lines}\n}}\n')
     look = Look(size=(20, 15), spp=4, rate=2)
     moving = frame_range(folder / "m.usda", look, range(1, 6, 2))
-    points = (mi.traverse(each.scene)["surface.control_points"] for each in moving.frames([1, 3, 5], None))
-    sizes = [np.abs(np.array(each)).max() for each in points]
+    points = (mi.traverse(loaded.scene)["surface.control_points"] for loaded in moving.frames([1, 3, 5], None))
+    sizes = [np.abs(np.array(values)).max() for values in points]
     np.testing.assert_allclose(sizes, [1, 3, 5], rtol=1e-6)
     assert render("m.usda", "-o", "m.png", "--frames", "1:5:4", *SMALL) == 0
     assert {path.name for path in folder.glob("m_*.png")} == {"m_0001.png", "m_0005.png"}

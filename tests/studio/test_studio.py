@@ -191,8 +191,8 @@ def test_cages_in_memory_are_read_back_from_a_saved_scene(tmp_path, cage, suffix
     assert (tmp_path / f"s_surface{suffix}").is_file()
     shapes = [
         result
-        for each in (scene, written)
-        for result in map(mi.traverse, load_scene(each).scene.shapes())
+        for source in (scene, written)
+        for result in map(mi.traverse, load_scene(source).scene.shapes())
         if "control_points" in result and len(result["control_points"]) == cage.positions.size
     ]
     keys = [set(result.keys()) for result in shapes]
@@ -308,8 +308,8 @@ def test_colours_of_vertices_are_seen(attribute, tmp_path):
         pytest.importorskip("plyfile")
         cage.save(tmp_path / "cube.ply")
         given.append(tmp_path / "cube.ply")
-    for each in given:
-        scene = studio_scene(each, view="front", up="z", **SMALL)
+    for model in given:
+        scene = studio_scene(model, view="front", up="z", **SMALL)
         image = np.array(mi.render(mi.load_dict(scene)))[..., :3]
         left, right = image[9, 9], image[9, 14]
         # Subdivision mixes the colours of the corners.
