@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,7 @@ class WorstPixel:
     x: int
     # Name of the tier that chose the pixel; "z-score" or "difference" where no tier failed or warned.
     shown_by: str
-    # The pixel's values; those of the first batch if the paired tier chose it.
+    # The pixel's values; those of the first batch if the paired tier chose it
     reference: tuple[float, ...]
     test: tuple[float, ...]
     # The first hit of the ray through the pixel, by the reference's probe, or else the test's.
@@ -53,18 +54,37 @@ class WorstPixel:
 
 @dataclass(eq=False)
 class Comparison:
-    """The result of a comparison; its status is the worst of the tiers'."""
+    """The result of a comparison."""
 
     reference: Image
     test: Image
-    status: Status
     tiers: list[TierResult]
-    # Further findings: the relative error of the whole image, files that changed, a second attempt.
-    notes: list[str]
-    # None only if the images are equal in all that was compared.
-    worst: WorstPixel | None
     tolerances: Tolerances
+    # Further results: the relative error of the whole image, files that changed, a second attempt
+    notes: list[str] = field(default_factory=list)
     numbers: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def status(self) -> Status:
+        """The worst of the tiers'."""
+        return max((tier.status for tier in self.tiers), key=list(Status).index)
+
+    @cached_property
+    def worst(self) -> WorstPixel | None:
+        """The pixel of the first tier that fails, else of the first that warns, else where the images differ most.
+
+        None only if the images are equal in all that was compared.
+        """
+        for status in (Status.FAIL, Status.WARN):
+            for tier in self.tiers:
+                if tier.status is status and tier.worst is not None:
+                    return _worst_pixel(self.reference, self.test, tier.worst, tier.name)
+        difference = np.abs(self.test.pixels - self.reference.pixels).max(axis=2)
+        if not difference.max() > 0:
+            return None
+        z = self.maps.get("z")
+        shown, shown_by = (difference, "difference") if z is None else (np.abs(z), "z-score")
+        return _worst_pixel(self.reference, self.test, pixel_of_largest(shown), shown_by)
 
     @property
     def exit_status(self) -> int:
@@ -111,29 +131,18 @@ class Comparison:
 def compare(
     reference: Image,
     test: Image,
+    # Names in `TIERS`; by default `DEFAULT_TIERS`, and FLIP besides if no tier can compare the radiance
     tiers: Sequence[str] | None = None,
-    tolerances: Tolerances | None = None,
-    suite_size: int = 1,
+    tolerances: Tolerances | None = None,  # By default those stored with the reference
+    suite_size: int = 1,  # Number of scenes that share the probability of a false alarm
 ) -> Comparison:
     """Compare a test with a reference.
 
     An image with pixels that are not finite fails at once, and no tier runs. The tile tier also runs, and decides,
     where the paired tier cannot: the samples are not the same, or pixels differ and so does the machine or the library.
     Where the same samples give the same bits and the probe passes, the tile tier cannot fail.
-
-    Parameters
-    ----------
-    tiers : sequence of str, optional
-        Names in `TIERS`. By default `DEFAULT_TIERS`; FLIP besides, if no tier can compare the radiance.
-    tolerances : Tolerances, optional
-        By default those stored with the reference.
-    suite_size : int
-        Number of scenes that share the probability of a false alarm.
-
-    Raises
-    ------
-    RegressionError
-        If an image is denoised, the sizes differ, a tier is unknown, or the images lack what a chosen tier compares.
+    Raises RegressionError if an image is denoised, the sizes differ, a tier is unknown, or the images lack what a tier
+    compares that was chosen.
     """
     for image in (reference, test):
         if image.metadata.get("denoised"):
@@ -152,7 +161,7 @@ def compare(
         broken = image.not_finite()
         if broken:
             result = TierResult("finite", Status.FAIL, [f"the {role} is not: {broken[0]}"], worst=broken[1])
-            return Comparison(reference, test, Status.FAIL, [result], [], _worst(reference, test, [result]), limits)
+            return Comparison(reference, test, [result], limits)
 
     compared_by: dict[str, Callable[[], TierResult]] = {
         "probe": lambda: compare_probes(reference, test, limits),
@@ -162,17 +171,9 @@ def compare(
     }
     results = {name: compared_by[name]() for name in tiers or DEFAULT_TIERS}
     _decide(results, compared_by, tiers)
-    weights = list(Status)
-    return Comparison(
-        reference,
-        test,
-        max((tier.status for tier in results.values()), key=weights.index),
-        list(results.values()),
-        [_relative_error(reference, test), *_changed_files(reference, test)],
-        _worst(reference, test, list(results.values())),
-        limits,
-        {"relmse": relmse(reference.pixels, test.pixels)},
-    )
+    notes = [_relative_error(reference, test), *_changed_files(reference, test)]
+    numbers = {"relmse": relmse(reference.pixels, test.pixels)}
+    return Comparison(reference, test, list(results.values()), limits, notes, numbers)
 
 
 def relmse(reference: NDArray[np.floating], test: NDArray[np.floating]) -> float:
@@ -224,20 +225,6 @@ def _changed_files(reference: Image, test: Image) -> list[str]:
         return []
     changed = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
     return [f"changed since the reference was made: {', '.join(changed)}"] if changed else []
-
-
-def _worst(reference: Image, test: Image, results: list[TierResult]) -> WorstPixel | None:
-    """The pixel of the first tier that fails, else of the first that warns, else where the images differ most."""
-    for status in (Status.FAIL, Status.WARN):
-        for result in results:
-            if result.status is status and result.worst is not None:
-                return _worst_pixel(reference, test, result.worst, result.name)
-    difference = np.abs(test.pixels - reference.pixels).max(axis=2)
-    if not difference.max() > 0:
-        return None
-    z = next((np.abs(result.maps["z"]) for result in results if "z" in result.maps), None)
-    shown, shown_by = (difference, "difference") if z is None else (z, "z-score")
-    return _worst_pixel(reference, test, pixel_of_largest(shown), shown_by)
 
 
 def _worst_pixel(reference: Image, test: Image, pixel: tuple[int, int], shown_by: str) -> WorstPixel:
