@@ -190,8 +190,7 @@ class BruteForce:
             faces = rotate(refined[4 * child : 4 * child + 4], -child)
         else:
             element = refined[child]
-            turned = element if child == 3 and self.scheme == "loop" else rotate(element, -child)
-            faces = [turned, *(f for f in self._touching(element, refined) if f is not element)]
+            faces = [rotate(element, -child), *(f for f in self._touching(element, refined) if f is not element)]
         names = {key: name for name, key in enumerate(dict.fromkeys(key for f in faces for key in f))}
         return _Node([tuple(names[key] for key in f) for f in faces], {name: point(key) for key, name in names.items()})
 

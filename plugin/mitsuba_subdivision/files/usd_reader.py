@@ -64,7 +64,7 @@ def read_usd(
     for mesh, location in zip(meshes, locations, strict=True):
         # Numbers that are not finite become errors that name their location.
         with usd_stage.usd_errors_at(location), np.errstate(over="ignore", invalid="ignore"):
-            contents.append(MeshReader(mesh, location, skinning, rules).contents())
+            contents.append(MeshReader(mesh, location, skinning, rules, is_cage=len(meshes) == 1).contents())
     return joined(contents, name)
 
 
@@ -80,8 +80,9 @@ class MeshReader:
         # Gets messages about attributes that do not fit the mesh, which are then left out, and their paths.
         # By default, these are errors.
         report: Callable[[str, object], None] | None = None,
+        is_cage: bool = False,  # Whether the mesh becomes a cage, which checks its values
     ) -> None:
-        self.mesh, self.location, self.skinning = mesh, location, skinning
+        self.mesh, self.location, self.skinning, self._is_cage = mesh, location, skinning, is_cage
         self._rules, self._report, self._source = rules or {}, report, CageSource(location)
 
     def contents(self, attributes: Collection[str] | None = None, texcoords: str | None = None) -> CageContents:
@@ -107,9 +108,9 @@ class MeshReader:
             vertices = vertices[order]
         if not np.array_equal(matrix, np.eye(4)):
             points = points @ matrix[:3, :3] + matrix[3, :3]
-        # What is made of several meshes, or for a scene, takes indices and points as they are.
-        points = validated_positions(points, self._source)
-        require_vertices(len(points), sizes, vertices, self._source)
+        if not self._is_cage:
+            points = validated_positions(points, self._source)
+            require_vertices(len(points), sizes, vertices, self._source)
         topology = Topology(len(points), sizes, vertices)
 
         def tags(noun: str, read: Callable[[Topology], NDArray], otherwise: NDArray) -> NDArray:
@@ -351,7 +352,7 @@ class MeshReader:
         topology: Topology,
         width: int | None,
     ) -> Attribute:
-        """A primvar as an attribute, checked."""
+        """A primvar as an attribute."""
         where = f'{self.location}: primvar "{shortened(primvar.GetPrimvarName())}"'
         indices = self.array(primvar.GetIndicesAttr(), np.int64) if primvar.IsIndexed() else None
         interpolation = primvar.GetInterpolation()
@@ -375,6 +376,8 @@ class MeshReader:
                     raise CageError(f"{where} has {len(indices)} values or indices; expected {count}, one per {per}")
                 indices = indices[rows]
             attribute = Attribute(values, "face_varying", indices)
+        if self._is_cage:
+            return attribute
         return validated_attribute(attribute, primvar.GetPrimvarName(), topology, self._source, width=width)
 
 
