@@ -4,16 +4,11 @@ import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision import ControlCage
 from mitsuba_subdivision.cage import named_cages
+from shapes.scenes import perspective, scene_with
 
 POINTS = "shape.control_points"
 # Samples per pixel are few for any one of these.
 RESOLUTION = 16
-
-
-def film(resolution):
-    """With samples beyond the border, without which projective integrators warn."""
-    size = {"width": resolution, "height": resolution}
-    return {"type": "hdrfilm", **size, "rfilter": {"type": "box"}, "sample_border": True, "pixel_format": "rgb"}
 
 
 # Inside
@@ -58,10 +53,9 @@ def inside(material, light, shape):
     """A view of the middle of a shape."""
     # Of directions that the diffuse material chooses, the variance is far larger: they turn with the tangents.
     samples = {} if material == "rough" else {"bsdf_samples": 0}
-    integrator, to_world = {"type": "direct", **samples}, mi.ScalarTransform4f().look_at([1, -4, 2], TARGET, UP)
-    sensor = {"type": "perspective", "fov": 14, "to_world": to_world, "film": film(RESOLUTION)}
+    sensor = perspective(RESOLUTION, [1, -4, 2], TARGET, UP, fov=14)
     shape = {**shape, "bsdf": materials()[material]}
-    return mi.load_dict({"type": "scene", "i": integrator, "sensor": sensor, "sky": sky(light), "shape": shape})
+    return scene_with(i={"type": "direct", **samples}, sensor=sensor, sky=sky(light), shape=shape)
 
 
 def tilt(positions):
@@ -83,11 +77,8 @@ def outline(shape, *, emits=False, resolution=32):
     The interior term is left out. It is zero, and so are shadows.
     """
     integrator = {"type": "direct_projective", "sppi": 0, "sppc": 0}
-    to_world = mi.ScalarTransform4f().look_at(EYE, TARGET, UP)
-    sensor = {"type": "perspective", "fov": FOV, "to_world": to_world, "film": film(resolution)}
-    scene = {"type": "scene", "integrator": integrator, "sensor": sensor, "shape": {**shape, "bsdf": BLACK}}
+    sensor = perspective(resolution, EYE, TARGET, UP, fov=FOV)
+    shape, sky = {**shape, "bsdf": BLACK}, {"sky": {"type": "constant"}}
     if emits:
-        scene["shape"]["emitter"] = LIGHT
-    else:
-        scene["sky"] = {"type": "constant"}
-    return mi.load_dict(scene)
+        shape, sky = {**shape, "emitter": LIGHT}, {}
+    return scene_with(integrator=integrator, sensor=sensor, shape=shape, **sky)

@@ -553,33 +553,9 @@ def test_stams_form_goes_wrong_as_it_is_published(valence, np_rng):
 
 # Gradients
 
-POINTS = "shape.control_points"
-
-
-# Of directions that the diffuse material chooses, the variance near a valence of 3 would be hundreds of times as much:
-# they turn with the tangents, whose derivatives have no bound there.
-@pytest.mark.parametrize(
-    ("by", "bsdf", "samples", "noise"),
-    [(POINTS, "conductor", {}, 2e-3), ("shape.to_world", "diffuse", {"bsdf_samples": 0}, 4e-3)],
-    ids=["mirror", "placement"],
-)
-def test_gradients_inside_an_outline_are_differences(by, bsdf, samples, noise):
-    shape = make(cube(), bsdf={"type": bsdf})
-    scene = scene_of(shape, {"type": "direct", **samples}, sky(), {"fov": 10, "resolution": 16})
-    parameters = mi.traverse(scene)
-    assign = moving(parameters, by, np.random.default_rng(1))
-
-    def mean():
-        return dr.mean(mi.render(scene, parameters, spp=256, seed=1), axis=None)
-
-    backward, forward, difference = (derivative(mode, assign, mean, 5e-3) for mode in MODES)
-    assert forward == pytest.approx(backward, rel=1e-3)
-    # Two standard deviations of either, and the kinks of the sky's interpolation in a mirror.
-    assert backward == pytest.approx(difference, rel=0.03, abs=noise)
-
 
 @pytest.mark.usefixtures("no_other_scene")
-@pytest.mark.parametrize("by", [POINTS, "shape.to_world"])
+@pytest.mark.parametrize("by", ["shape.control_points", "shape.to_world"])
 def test_derivatives_of_hits_by_parameters_are_differences(by, np_rng):
     """Of points and normals, where the shape is sheared and mirrored; forward and backward."""
     scene = scene_of(make(cube(), tessellation_rate=4, to_world=mi.ScalarTransform4f(MIRRORED)))

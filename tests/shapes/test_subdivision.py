@@ -6,18 +6,15 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, upload
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.tessellation import Criterion, Measure
 from peers.fidelity_cages import book, fan, joined, pole
 from peers.fidelity_cages import cube as box
 from reference.bars import NORMAL_FLOAT32, NORMAL_FLOAT32_VALENCES
 from reference.exact_samples import SCHEMES, angle, samples_at
 from shapes.cages import cube, described, load, with_attributes
-from shapes.scenes import SINGLE, WIDTHS, buffer, down, hit, perspective, scene_with, vertices
-from shapes.updates import MODES, derivative, differentiated, update
-from shapes.variants import every_ad_variant, every_variant, mirrors, scalar
+from shapes.scenes import SINGLE, WIDTHS, buffer, down, hit, scene_with, vertices
+from shapes.updates import update
+from shapes.variants import every_variant, mirrors, scalar
 
-# Of sums of some hundred positions of about one in single precision.
-SUMMED = 2e-4
 SCENE = """<scene version="3.0.0">
 <shape type="subdivision"><string name="filename" value="{}"/></shape></scene>"""
 
@@ -266,52 +263,6 @@ def test_update_equals_a_new_shape(np_rng, mirror):
     assert dr.allclose(shape.bbox().max, expected.bbox().max, atol=SINGLE)
 
 
-CHORD = {"tessellation": "adaptive", "chord_error": 1e-2}
-
-
-@with_warnings
-@every_ad_variant
-@pytest.mark.parametrize(("name", "options"), [*((name, {}) for name in NON_MANIFOLD), ("valence 5", CHORD)])
-def test_gradients_are_those_of_the_weights(name, options):
-    """Positions are linear in the control points, so that a difference over any step is the derivative."""
-    cage, rng = CAGES[name](), np.random.default_rng(1)
-    surface = LimitSurface(cage)
-    table = surface.adaptive_sampling(Criterion(Measure.CHORD, 1e-2), 64) if options else surface.sampling(4)
-    weights, direction = rng.uniform(-1, 1, (table.vertex_count, 3)), rng.uniform(-1, 1, cage.positions.shape)
-    parameters = mi.traverse(load(cage, **(options or {"tessellation_rate": 4})))
-    points = differentiated(parameters, "control_points")
-    dr.backward(dr.sum(parameters["vertex_positions"] * upload(mi.Float, weights)))
-    gradient = np.array(dr.grad(points)).reshape(-1, 3)
-    moved, before = (table.apply(positions)[0] for positions in (cage.positions + direction, cage.positions))
-    assert (gradient * direction).sum() == pytest.approx((weights * (moved - before)).sum(), abs=SUMMED)
-
-
-@pytest.mark.parametrize(("integrator", "by"), [("prb", "control_points"), ("direct_projective", "to_world")])
-@every_ad_variant
-def test_gradients_of_renders_reach_control_points_and_placement(integrator, by):
-    """A cube that grows under a sky: of a point light's shadows, projective integrators leave out derivatives."""
-    # Mitsuba never frees a scene with samples of indirect outlines; the cube has none to see.
-    integrator = {"type": integrator, **({"sppi": 0} if integrator == "direct_projective" else {})}
-    sensor, shape = perspective(16, [1, 2, 5], up=[0, 1, 0]), described(cube(), tessellation_rate=4)
-    scene = scene_with(integrator=integrator, sensor=sensor, sky={"type": "constant"}, shape=shape)
-    parameters, points = mi.traverse(scene), mi.Float(mi.traverse(scene)["shape.control_points"])
-
-    def grow(step):
-        larger = points * (1 + step) if by == "control_points" else mi.AffineTransform4f().scale(1 + step)
-        update(parameters, {f"shape.{by}": larger})
-
-    def mean():
-        return dr.mean(mi.render(scene, parameters, spp=256, seed=1), axis=None)
-
-    backward, forward, difference = (derivative(mode, grow, mean, 0.02) for mode in MODES)
-    assert np.isfinite(backward)
-    assert backward != 0
-    if by == "to_world":
-        # Growing covers more of the sky: silhouettes matter. Monte Carlo noise at 256 samples is a few per cent.
-        assert backward == pytest.approx(difference, rel=0.1)
-    assert forward == pytest.approx(backward, rel=0.1)
-
-
 # In a scene
 
 
@@ -330,20 +281,6 @@ def test_two_shapes_with_the_same_material_keep_their_parameters():
 
 
 @every_variant
-def test_instances():
-    scene = {"group": {"type": "shapegroup", "shape": described(cube())}}
-    for x in (-3, 3):
-        to_world = mi.ScalarTransform4f().translate([x, 0, 0])
-        scene[f"at_{x}"] = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world}
-    scene = scene_with(**scene)
-    for x in (-3, 3):
-        si = scene.ray_intersect(down(x + 0.1, 0.1, 9))
-        assert dr.all(si.is_valid())
-        assert dr.all(si.sh_frame.n.z > 0.9)
-    assert not dr.any(scene.ray_intersect(down(0.1, 0.1, 9)).is_valid())
-
-
-@every_variant
 def test_area_emitters_and_elements_of_faces_follow_the_triangles():
     shape = make(emitter={"type": "area", "radiance": 2.0})
     assert len(scene_with(shape=shape).emitters()) == 1
@@ -355,15 +292,3 @@ def test_area_emitters_and_elements_of_faces_follow_the_triangles():
     assert dr.allclose(si.shape.eval_attribute_1("face_element", si), expected)
     update(shape, control_points=mi.traverse(shape)["control_points"] * 2)
     assert dr.allclose(shape.surface_area(), 4 * area, rtol=1e-5)
-
-
-@pytest.mark.core
-@every_variant
-def test_renders():
-    sensor, shape = perspective(16, [1, 2, 5], up=[0, 1, 0]), described(cube(), tessellation_rate=4)
-    scene = scene_with(integrator={"type": "direct"}, sensor=sensor, sky={"type": "constant"}, shape=shape)
-    image = np.array(mi.render(scene, spp=4))
-    assert np.isfinite(image).all()
-    # The shape reflects half of the sky, which is behind it.
-    assert 0.3 < image[8, 8].min() < 0.7
-    assert np.allclose(image[0, 0], 1)

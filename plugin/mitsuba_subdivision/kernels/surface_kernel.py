@@ -15,13 +15,13 @@ from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Ra
 from .line_intersection import MISSED, ON_LINE, LineHits, Lines, line_hits
 from .linear_maps import CoefficientMap, ControlValues
 from .locations import Location
-from .nearest_points import NearestPoints, nearest_locations
 from .piece_kernel import PatchValues, Piece, PieceKernel, differences
 from .vertex_kernel import coordinates_expected
 
 if TYPE_CHECKING:
     from ..patches import PieceTable, SamplingCells
     from .displacement import Displacement
+    from .nearest_points import NearestPoints
 
 # Largest distance of a hit from its line, relative to the longest derivative of the surface; used by `intersect`.
 NEAR_LINE = 1e-4
@@ -212,6 +212,8 @@ class SurfaceKernel:
         element, uv, corner, derivatives
             As for `evaluate`: starting point of the search.
         """
+        from .nearest_points import nearest_locations
+
         points = self.types.converted(self.types.vector3, points)
         start = dr.detach(self._location(element, uv, corner))
         piece_at = partial(self._patches.piece, dr.detach(self.coefficients))

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from ..device_arrays import upload
 from ..kernels.algebra import AffineMap, added, dot, over
 from ..kernels.array_types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Value, Vector2, Vector3
-from ..kernels.channel_kernel import ChannelKernel, channel_kernel
 from ..kernels.line_intersection import ON_LINE, Lines
 from ..kernels.linear_maps import ControlValues
 from ..kernels.locations import Location, TriangleLocations
@@ -29,6 +28,7 @@ from .cage_attributes import WIDTHS, SpectralUpsampling, holds_spectra, mesh_nam
 from .placement import Placement
 
 if TYPE_CHECKING:
+    from ..kernels.channel_kernel import ChannelKernel
     from ..tessellation import VertexTable
     from .interaction_hook import TriangleHit
 
@@ -114,13 +114,12 @@ class ExactShading:
         if split.surface_vertex is None:
             return AttributeTable(_welded(table), values)
         _, first = np.unique(split.surface_vertex, return_index=True)
-        locate = split.locate
 
         def first_ones() -> tuple[IntArray, FloatArray]:
-            start, uv = (locate or table.locations)()
+            start, uv = (split.locate or table.locations)()
             return start[first], uv[first]
 
-        layout = _welded(table, split.layout, None if locate is None else first_ones)
+        layout = _welded(table, split.layout, first_ones)
         return AttributeTable(layout, {name: value[first] for name, value in values.items()})
 
     def follow(self, shape: mi.Mesh) -> None:
@@ -144,6 +143,8 @@ class ExactShading:
     def channel(self, name: str) -> ChannelKernel:
         """Return the kernel of an attribute of the cage or of its texture coordinates, created at the first call."""
         if name not in self._channels:
+            from ..kernels.channel_kernel import channel_kernel
+
             kernel = self.kernel
             self._channels[name] = channel_kernel(self._limit_surface.channel(name), kernel.walk, kernel.types.float)
         return self._channels[name]
