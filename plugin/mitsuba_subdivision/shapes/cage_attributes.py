@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
+from weakref import WeakMethod
 
 import drjit as dr
 import mitsuba as mi
@@ -67,8 +68,9 @@ class CageAttributes:
         variant: Variant,
         surface: LimitSurface,
         names: Iterable[str],  # Names of the attributes that `traverse` exposes
-        # Called with an attribute's name and the gradient by its values, after reverse mode has reached these
-        on_backward: Callable[[str, FloatBuffer], None],
+        # Method that is called with an attribute's name and the gradient by its values, by the same name, after reverse
+        # mode has reached these
+        on_backward: WeakMethod,
     ) -> None:
         self._on_backward = on_backward
         self._source = surface.cage.source.name
@@ -186,10 +188,9 @@ class CageAttributes:
         return self._weights[key]
 
     def _move(self, name: str) -> None:
-        values, on_backward = self.values[f"{PREFIX}{name}"], self._on_backward
+        values = self.values[f"{PREFIX}{name}"]
         if dr.grad_enabled(values):
-            # The operation, which these values keep alive, must not keep this object alive.
-            values = dr.custom(Watched, {name: values}, lambda gradients: on_backward(name, gradients[name]))[name]
+            values = dr.custom(Watched, {name: values}, self._on_backward, (name,))[name]
         self._moved[name] = values
         for take in self._followers.get(name, ()):
             take(values)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -17,10 +16,11 @@ _HALF = 32
 
 
 class Watched(dr.CustomOp):
-    """Identity function of arrays, which calls a function after reverse mode has passed through it."""
+    """Identity function of arrays, which calls a method after reverse mode has passed through it."""
 
-    def eval(self, arrays, on_backward):
-        self.on_backward = on_backward
+    # The method's reference is weak, as the arrays must not keep the shape alive.
+    def eval(self, arrays, method, arguments):
+        self.method, self.arguments = method, arguments
         # Copies, because Dr.Jit attaches derivatives to the returned arrays themselves.
         return {name: type(array)(array) for name, array in arrays.items()}
 
@@ -28,24 +28,13 @@ class Watched(dr.CustomOp):
         self.set_grad_out(self.grad_in("arrays"))
 
     def backward(self):
-        gradients = self.grad_out()
+        gradients, method = self.grad_out(), self.method()
         self.set_grad_in("arrays", gradients)
-        self.on_backward(gradients)
+        if method is not None:
+            method(*self.arguments, gradients)
 
     def name(self):
         return "Watched"
-
-
-def on_backward_of(renew: Callable[..., None]) -> Callable[..., None]:
-    """Return a function that calls the bound method ``renew`` of a shape without keeping the shape alive."""
-    reference = weakref.WeakMethod(renew)
-
-    def call(*arguments: Any) -> None:
-        method = reference()
-        if method is not None:
-            method(*arguments)
-
-    return call
 
 
 def warn_of_lost(name: str, parameters: str) -> None:

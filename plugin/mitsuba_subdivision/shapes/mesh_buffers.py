@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
+from weakref import WeakMethod
 
 import drjit as dr
 import numpy as np
@@ -59,8 +60,8 @@ class MeshBuffers:
         placement: Placement,
         shading: ExactShading | None,
         displacement: ShapeDisplacement | None,
-        # Called with the gradients of the moving arrays, by name, after each reverse-mode pass
-        on_backward: Callable[[dict[str, FloatBuffer | Matrix4]], None],
+        # Method that is called with the gradients of the moving arrays, by name, after each reverse-mode pass
+        on_backward: WeakMethod,
     ) -> None:
         self._variant, self._attributes, self._kept = variant, attributes, kept
         self.table, self.layout, self._parameters = table, attributes.layout, parameters
@@ -217,7 +218,7 @@ class MeshBuffers:
         if self.are_differentiable:
             attached = {name: array for name, array in moved.items() if dr.grad_enabled(array)}
             if attached:
-                moved |= dr.custom(Watched, attached, self._on_backward)
+                moved |= dr.custom(Watched, attached, self._on_backward, ())
         if shading is not None:
             shading.set_transform(moved.pop("to_world"), moved.pop("coefficients"), placement)
         return moved

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
+from weakref import WeakMethod
 
 import drjit as dr
 import mitsuba as mi
@@ -15,7 +16,6 @@ from ..llvm import require_llvm
 from ..surface import TEXCOORDS
 from ..variants import Variant
 from .cage_attributes import PREFIX, CageAttributes, mesh_attributes, mesh_name
-from .derivatives import on_backward_of
 from .device_state import DeviceState, is_recording, paused_collection, traversed
 from .mesh_buffers import MeshBuffers, require_control_points
 from .parameter_table import errors_about, plugin_page
@@ -90,7 +90,7 @@ def make_subdivision(
                     )
             attributes = mesh_attributes(surface.cage)
             exposed = [name for name in (TEXCOORDS, *attributes) if name in surface.attribute_names]
-            self._cage = CageAttributes(variant, surface, exposed, on_backward_of(self.renew_attribute))
+            self._cage = CageAttributes(variant, surface, exposed, WeakMethod(self.renew_attribute))
             if self._exact is not None:
                 for name, values in self._exact.values.items():
                     self._cage.add_follower(name, values.set)
@@ -148,7 +148,7 @@ def make_subdivision(
                 self._placement,
                 self._exact,
                 self._displacement,
-                on_backward_of(self.renew_derivatives),
+                WeakMethod(self.renew_derivatives),
             )
             self._has_outlines = False
             self._texture_scene = None
@@ -288,10 +288,10 @@ def make_subdivision(
             with dr.resume_grad():
                 self._attach_vertices()
 
-        def renew_attribute(self, name: str, gradient: FloatBuffer) -> None:
+        def renew_attribute(self, name: str, gradients: dict[str, FloatBuffer]) -> None:
             """Attach the arrays computed from an attribute's control values again; see `CageAttributes`."""
             with dr.resume_grad():
-                self._cage.renew(name, gradient)
+                self._cage.renew(name, gradients[name])
                 self._replace_gradients(self._cage.buffers([name]))
                 if self._mesh.are_differentiable and f"{PREFIX}{name}" in self._cage.moving:
                     self._attach_vertices()
