@@ -136,21 +136,6 @@ def half_edges_around(frames: PatchFrames, corner: IntArray) -> list[IntArray]:
     return around
 
 
-def vertices_at_corners(tiles: Tiles, frames: PatchFrames) -> IndexArray:
-    """``(m, t)`` half-edge that begins at the vertex of the elements at each corner of tiles; -1 at other corners."""
-    corner, depth = tiles["corner"], tiles["depth"]
-    is_whole = frames.is_whole[frames.topology.face[corner]]
-    half_edges = np.full((frames.domain.corner_count, len(tiles)), -1, dtype=np.int32)
-    for number, half_edge in enumerate(half_edges_around(frames, corner)):
-        # Origin of the tile at this corner of the patch.
-        u, v = (int(end) * ((1 << depth) - 1) for end in frames.domain.corners[number])
-        is_there = (tiles["origin"][:, 0] == u) & (tiles["origin"][:, 1] == v) & ~tiles["is_flipped"]
-        # Patches of polygons begin at the only vertex that they have.
-        is_there &= is_whole | (number == 0)
-        half_edges[number, is_there] = half_edge[is_there]
-    return half_edges
-
-
 class Sides(NamedTuple):
     """The lines on which sides of tiles lie: edges of elements, spokes of polygons, and lines inside patches.
 
@@ -164,6 +149,14 @@ class Sides(NamedTuple):
     begin: IntArray
     end: IntArray
     bits: int
+
+    def at_vertices(self, corner_count: int) -> IndexArray:
+        """``(t, m)`` half-edge that begins at the vertex of the elements at each corner of tiles; -1 at other corners.
+
+        There, two successive sides lie on edges.
+        """
+        half_edge = self.half_edge.reshape(-1, corner_count)
+        return np.where(np.roll(half_edge, 1, axis=1) >= 0, half_edge, -1)
 
     def points(self, edge: IndexArray, side: IntArray | slice, position: IntArray) -> NDArray[np.int64]:
         """``(n,)`` sort keys of positions on lines, equal for equal points on edges with equal numbers ``edge``."""
@@ -231,7 +224,7 @@ class AdaptiveGrid:
         if is_valence_two.any():
             # At vertices of valence 2, no triangle cuts off the corner of a tile: two tiles meet along both sides, and
             # both would have the same triangle.
-            half_edge = vertices_at_corners(tiles, frames).T
+            half_edge = sides_of(tiles, frames, int(tiles["depth"].max(initial=0))).at_vertices(m)
             keeps_corner = (half_edge >= 0) & is_valence_two[t.face_vertices[half_edge]]
             needs_inner |= keeps_corner.any(axis=1)
         if needs_inner.any():
@@ -266,7 +259,7 @@ class AdaptiveGrid:
         # At a tile's corner, a side begins where another ends, and maybe a vertex is. Vertices come first.
         point += int(vertex.max(initial=-1)) + 1
         begin, end = point[ragged.starts(self.side_counts.ravel())], np.roll(point[count:].reshape(-1, m), 1, axis=1)
-        half_edge = vertices_at_corners(self.tiles, self.frames).T.ravel()
+        half_edge = self.sides.at_vertices(m).ravel()
         at_vertex = np.flatnonzero(half_edge >= 0)
         pairs = np.stack([begin, end.ravel()]), np.stack([begin[at_vertex], vertex[half_edge[at_vertex]]])
         return ranked(_least_joined(int(point.max(initial=0)) + 1, np.concatenate(pairs, axis=1))[point[:count]])
