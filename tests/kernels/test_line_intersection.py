@@ -3,7 +3,7 @@
 import drjit as dr
 import numpy as np
 import pytest
-from kernels.surfaces import aimed, hit, kernel_named, random_locations, surface_named, vectors
+from kernels.surfaces import aimed, computed, hit, kernel_named, random_locations, surface_named, vectors
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary_triangles
 from mitsuba_subdivision.device_arrays import upload
@@ -59,9 +59,7 @@ def met_past_a_border(kernel, surface, beyond, turns=0):
     for _ in range(turns):
         u, v, corner = v, 1 - u, (corner + 1) % 4
     start = kernel.walk.at(types.indices(element), types.floats(u), types.floats(v), types.indices(corner))
-    met = kernel.line_hits(upload(types.vector3, p), upload(types.vector3, d), start)
-    dr.eval(met.location, met.kind, met.values.value)
-    return p, met
+    return p, *computed(kernel.line_hits(upload(types.vector3, p), upload(types.vector3, d), start))
 
 
 @pytest.mark.core
@@ -69,11 +67,11 @@ def met_past_a_border(kernel, surface, beyond, turns=0):
 @pytest.mark.parametrize("beyond", [1e-5, 1e-3, 1e-2, 5e-2])
 def test_lines_past_a_border_lead_to_the_border(variant, beyond):
     surface, kernel = surface_named("sheet without corners"), kernel_named("sheet without corners", variant)
-    p, met = met_past_a_border(kernel, surface, beyond)
-    assert (np.array(met.kind) == ON_NORMAL).all()
-    found = kernel.at(met.location)
-    np.testing.assert_allclose(vectors(met.values.value), vectors(found.p), rtol=0, atol=POINT[variant])
-    inside = surface.scheme.domain.inside(np.array([met.location.u, met.location.v]).T)
+    p, location, kind, values = met_past_a_border(kernel, surface, beyond)
+    assert (np.array(kind) == ON_NORMAL).all()
+    found = kernel.at(location)
+    np.testing.assert_allclose(vectors(values.value), vectors(found.p), rtol=0, atol=POINT[variant])
+    inside = surface.scheme.domain.inside(np.array([location.u, location.v]).T)
     np.testing.assert_allclose(inside, 0, rtol=0, atol=ON_RAY[variant])
     assert np.linalg.norm(vectors(found.p) - p, axis=1).max() <= 1.5 * beyond + ON_RAY[variant]
 
@@ -82,11 +80,11 @@ def test_lines_past_a_border_lead_to_the_border(variant, beyond):
 @pytest.mark.parametrize("beyond", [1e-2, 1.0])
 def test_lines_find_the_same_place_of_a_border_seen_from_any_corner(beyond):
     surface, kernel = surface_named("sheet without corners"), kernel_named("sheet without corners", DOUBLE)
-    _, expected = met_past_a_border(kernel, surface, beyond)
+    _, expected, _, expected_values = met_past_a_border(kernel, surface, beyond)
     for turns in (1, 2, 3):
-        _, met = met_past_a_border(kernel, surface, beyond, turns)
-        np.testing.assert_array_equal(met.location.half_edge, expected.location.half_edge)
-        both = vectors(met.values.value), vectors(expected.values.value)
+        _, location, _, values = met_past_a_border(kernel, surface, beyond, turns)
+        np.testing.assert_array_equal(location.half_edge, expected.half_edge)
+        both = vectors(values.value), vectors(expected_values.value)
         np.testing.assert_allclose(*both, rtol=0, atol=ON_RAY[DOUBLE])
 
 
@@ -158,12 +156,12 @@ def test_locations_are_where_the_points_lie_however_few_rounds_there_are(monkeyp
     start = kernel.walk.at(
         types.indices(samples.element), types.floats(u), types.floats(v), types.indices(samples.corner)
     )
-    met = kernel.line_hits(upload(types.vector3, samples.p), upload(types.vector3, samples.n), start)
-    dr.eval(met.location, met.kind, met.values.value)
-    are_hit = np.array(met.kind) == ON_LINE
+    lines = upload(types.vector3, samples.p), upload(types.vector3, samples.n)
+    location, kind, values = computed(kernel.line_hits(*lines, start))
+    are_hit = np.array(kind) == ON_LINE
     assert are_hit.any()
-    again = vectors(kernel.at(met.location).p)
-    np.testing.assert_allclose(again[are_hit], vectors(met.values.value)[are_hit], rtol=0, atol=ON_RAY[DOUBLE])
+    again = vectors(kernel.at(location).p)
+    np.testing.assert_allclose(again[are_hit], vectors(values.value)[are_hit], rtol=0, atol=ON_RAY[DOUBLE])
 
 
 def first_hits(o, d, corners):

@@ -5,7 +5,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface, upload
-from mitsuba_subdivision.shapes.displacement import AttributeHeights, TextureHeights
+from mitsuba_subdivision.kernels.displacement import Heights
+from mitsuba_subdivision.shapes.displacement import TextureHeights
 from shapes.cages import cube, load
 from shapes.scenes import waves
 from shapes.updates import update
@@ -120,7 +121,7 @@ def test_ranges_are_those_of_texels_of_luminances_of_samples_and_of_an_attribute
     is_range(heights_of({"type": "uniform", "value": 0.25}), 0.25, 0.25, rel=0, abs=0)
     is_range(heights_of({"type": "checkerboard"}), 0.2, 0.4)
     cage = cube(attributes={"height": np.linspace(-1, 2, 8)[:, None]})
-    is_range(AttributeHeights(), -1, 2, channel=LimitSurface(cage).channel("height"), rel=0, abs=0)
+    is_range(Heights(), -1, 2, channel=LimitSurface(cage).channel("height"), rel=0, abs=0)
 
 
 @every_variant

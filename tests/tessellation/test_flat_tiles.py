@@ -57,7 +57,7 @@ def sizes(samples, axes):
 
 
 def extents(tile, values, axes):
-    return _extent(tile, values, np.repeat(axes[:, :, None], values.shape[2], axis=2))
+    return _extent(tile.hull, values, np.repeat(axes[:, :, None], values.shape[2], axis=2))
 
 
 def assert_tight(found, axes, samples, loose=LOOSE):

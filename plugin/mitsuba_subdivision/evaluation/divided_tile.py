@@ -25,8 +25,8 @@ from .polynomials import polynomial_basis, times
 
 # Number of divisions before a tile is bounded by its pieces and the parts that are still undivided. For surfaces it
 # depends on `Scheme.has_convex_rules`: without convex rules the bound of undivided parts is some ten times looser.
-# Curves along sides have few coefficients.
-DIVISIONS, DIVISIONS_OF_SIDES = {True: 8, False: 32}, 32
+# Curves along sides have few coefficients. Most flat tiles are flat by the fewer points of hulls after few divisions.
+DIVISIONS, DIVISIONS_OF_SIDES, FEW_DIVISIONS = {True: 8, False: 32}, 32, (1, 4)
 # Number of divisions before normals are bounded on the pieces.
 DIVISIONS_OF_NORMALS = 4
 
@@ -122,6 +122,12 @@ class DividedTile:
         None where rules are not convex and parts are undivided that are not around one extraordinary point.
         """
         return self._hull(DIVISIONS[self._scheme.has_convex_rules])
+
+    @cached_property
+    def hulls(self) -> list[FloatArray]:
+        """Stencils like `hull`, which is the last, of fewer points at first, whose hulls are larger."""
+        rough = [self._hull(divisions) for divisions in FEW_DIVISIONS] if not self.is_piece else []
+        return [stencils for stencils in [*rough, self.hull] if stencils is not None]
 
     @cached_property
     def side_hulls(self) -> list[FloatArray | None]:

@@ -24,6 +24,7 @@ from .array_types import Float, Index, Mask, Value
 from .piece_kernel import PatchValues, Piece, differences
 
 if TYPE_CHECKING:
+    from ..patches import Channel
     from .channel_kernel import ChannelKernel
 
 # Minimum cosine of the angle between the normal and the cross product of the derivatives at which these span the
@@ -46,6 +47,10 @@ class Heights:
     def variables(self) -> list:
         """Arrays that the heights are differentiable with respect to."""
         return []
+
+    def range(self, channel: Channel) -> tuple[float, float]:
+        """Interval of the control values, which contains all heights because weights are not negative."""
+        return float(channel.values.min()), float(channel.values.max())
 
 
 def displaced(

@@ -36,15 +36,6 @@ _ENDED = 4
 
 
 @dataclass(frozen=True, eq=False)
-class LineHits:
-    """Hits of lines on a surface."""
-
-    location: Location  # Seen from the first corner in whole elements
-    kind: Index  # `ON_LINE`; `ON_NORMAL`, also for a point on a border or a crease beside the line; or `MISSED`
-    values: PatchValues  # The surface at the location, detached and without second derivatives
-
-
-@dataclass(frozen=True, eq=False)
 class Lines:
     """Lines that constrain surface points when control points or the lines change."""
 
@@ -77,8 +68,12 @@ def line_hits(
     # Wanted sign of the dot product of the normal and ``d``; 0 for either. A line that enters a ball also leaves it,
     # and Newton's method may converge to either hit.
     facing: Float = 0,
-) -> LineHits:
-    """Intersect lines with a surface near given locations. Arguments must be detached."""
+) -> tuple[Location, Index, PatchValues]:
+    """Intersect lines with a surface near given locations. Arguments must be detached.
+
+    Returns locations, seen from the first corner in whole elements; the kinds of hits: `ON_LINE`, `ON_NORMAL`, also for
+    a point on a border or a crease beside the line, or `MISSED`; and the surface there, without second derivatives.
+    """
     types = walk.types
     relative_rounding = rounding(types)
 
@@ -134,7 +129,7 @@ def line_hits(
         label="line_intersection",
     )
     from_first, corner = walk.from_first(Location(half_edge, u, v), active)
-    return LineHits(from_first, aim & (_ENDED - 1), PatchValues(*values).seen_from_first(walk, corner))
+    return from_first, aim & (_ENDED - 1), PatchValues(*values).seen_from_first(walk, corner)
 
 
 def piece_hits(

@@ -12,7 +12,7 @@ import numpy as np
 
 from .algebra import AffineMap, cross, over, rounding, unit
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector3
-from .line_intersection import MISSED, ON_LINE, LineHits, Lines, line_hits
+from .line_intersection import MISSED, ON_LINE, Lines, line_hits
 from .linear_maps import CoefficientMap, ControlValues
 from .locations import Location
 from .piece_kernel import PatchValues, Piece, PieceKernel, differences
@@ -176,9 +176,9 @@ class SurfaceKernel:
         direction, origin = dr.detach(d), dr.detach(o)
         projection = self.at(start, moves=False).p - origin
         projection = origin + direction * (dr.dot(projection, direction) / dr.squared_norm(direction))
-        hits = self.line_hits(projection, direction, start)
-        lines = Lines(o, d, hits.kind == ON_LINE)
-        points = self.at(hits.location, derivatives=derivatives, constraint=lines, values=hits.values)
+        location, kind, values = self.line_hits(projection, direction, start)
+        lines = Lines(o, d, kind == ON_LINE)
+        points = self.at(location, derivatives=derivatives, constraint=lines, values=values)
         along_ray = points.p - o
         t = dr.dot(along_ray, d) / dr.squared_norm(d)
         squared_distance = dr.squared_norm(dr.detach(along_ray - d * t))
@@ -186,7 +186,7 @@ class SurfaceKernel:
         # Next to extraordinary points, rounding errors exceed this distance.
         squared_size = dr.squared_norm(dr.detach(points.p)) + dr.squared_norm(dr.detach(along_ray))
         is_on_line = squared_distance < dr.maximum(tolerance, dr.square(rounding(self.types)) * squared_size)
-        t = dr.select((hits.kind != MISSED) & is_on_line, t, dr.inf)
+        t = dr.select((kind != MISSED) & is_on_line, t, dr.inf)
         return replace(points, t=t)
 
     def closest(
@@ -348,7 +348,9 @@ class SurfaceKernel:
         piece = self._patches.piece(coefficients, half_edge, u, v, active, row)
         return piece if self.displacement is None else self.displacement.piece(piece, half_edge, u, v, active)
 
-    def line_hits(self, p: Vector3, d: Vector3, location: Location, active: Mask = True, **limits: Float) -> LineHits:
+    def line_hits(
+        self, p: Vector3, d: Vector3, location: Location, active: Mask = True, **limits: Float
+    ) -> tuple[Location, Index, PatchValues]:
         """Intersect lines with the surface near given locations, see `line_hits`. Results are detached."""
         # Optimised loops are traced twice, which takes longer than it saves.
         with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):

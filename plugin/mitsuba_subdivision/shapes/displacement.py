@@ -69,8 +69,7 @@ class ShapeDisplacement:
                 f"a texture was given, and {surface.cage.source.name} has no texture coordinates; expected a cage "
                 "with some, or the name of an attribute"
             )
-        self.heights: AttributeHeights | TextureHeights
-        self.heights = AttributeHeights() if isinstance(given, str) else TextureHeights(variant, given)
+        self.heights = Heights() if isinstance(given, str) else TextureHeights(variant, given)
         # The channel as it was loaded, and with its current values: None if these have not been read from the device.
         self._loaded = surface.channel(self.attribute)
         self._channel: Channel | None = self._loaded
@@ -172,14 +171,6 @@ def _attribute_named(given: str, surface: LimitSurface) -> str:
 
 
 # Heights are evaluated for arrays of a kernel, single points, and arrays on the host.
-
-
-class AttributeHeights(Heights):
-    """Heights equal to a channel's values."""
-
-    def range(self, channel: Channel) -> tuple[float, float]:
-        """Interval of the control values, which contains all heights because weights are not negative."""
-        return float(channel.values.min()), float(channel.values.max())
 
 
 class TextureHeights(Heights):

@@ -183,15 +183,16 @@ class ExactShading:
             dot(d, d)
         )
         facing = dot(vector3(dr.detach(si.n)), ray_direction)
-        hits = kernel.line_hits(hit, d, location, active, max_distance=farthest, facing=facing * self._sign)
-        self._count(hits.kind, active)
+        limits = {"max_distance": farthest, "facing": facing * self._sign}
+        location, kind, values = kernel.line_hits(hit, d, location, active, **limits)
+        self._count(kind, active)
         to_world = AffineMap.of(self.to_world) if moves and dr.grad_enabled(self.to_world) else self._map
         lines = None
         if not flags & _FOLLOWS and (moves or dr.grad_enabled(ray.o, ray.d)):
             o, ray_direction = to_world.inverse_point(vector3(ray.o)), to_world.inverse_direction(vector3(ray.d))
-            lines = Lines(o, ray_direction, hits.kind == ON_LINE)
+            lines = Lines(o, ray_direction, kind == ON_LINE)
         order = 2 if flags & _NORMAL_DERIVATIVES else 1
-        points = kernel.at(hits.location, active, order, constraint=lines, moves=moves, values=hits.values)
+        points = kernel.at(location, active, order, constraint=lines, moves=moves, values=values)
         is_before = active & (dot(dr.detach(points.p) - hit, d) < 0)
         points = points.placed(to_world)
         if flags & _PARAMETERS:
@@ -230,8 +231,8 @@ class ExactShading:
         to_world, direction = self._map, self._direction(si, wi)
         start = self._located(si.prim_index, 1 / 3, 1 / 3, active)
         hit = to_world.inverse_point(vector3(dr.detach(si.p)))
-        hits = self.kernel.line_hits(hit, to_world.inverse_direction(direction), start, active)
-        location, kind, shape = hits.location, hits.kind, self._shape()
+        location, kind, _ = self.kernel.line_hits(hit, to_world.inverse_direction(direction), start, active)
+        shape = self._shape()
         if shape is None or int(shape.bsdf().flags()) & int(mi.BSDFFlags.BackSide):
             # Where `twosided` has swapped front and back, intersect the mirrored ray.
             mirrored = self._direction(si, type(wi)(wi.x, wi.y, -wi.z))
@@ -241,8 +242,8 @@ class ExactShading:
                 if self._texcoords is not None:
                     u, v = self._texcoords(location, active)[0]
             is_mirrored = active & (dr.maximum(dr.abs(u - si.uv.x), dr.abs(v - si.uv.y)) > SAME_PARAMETERS)
-            hits = self.kernel.line_hits(hit, to_world.inverse_direction(mirrored), start, is_mirrored)
-            location, kind = location.chosen(is_mirrored, hits.location), dr.select(is_mirrored, hits.kind, kind)
+            at_mirrored = self.kernel.line_hits(hit, to_world.inverse_direction(mirrored), start, is_mirrored)
+            location, kind = location.chosen(is_mirrored, at_mirrored[0]), dr.select(is_mirrored, at_mirrored[1], kind)
             direction = dr.select(is_mirrored, mirrored, direction)
         if dr.grad_enabled(si.p):
             # The hit stays on its line. So does the point of the interaction, even if it is that of the triangle.

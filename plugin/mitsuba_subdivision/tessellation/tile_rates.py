@@ -129,16 +129,18 @@ class TileRates:
         if heights is not None:
             height_range = np.nanmax(heights, axis=(0, 1)) - np.nanmin(heights, axis=(0, 1))
         if self.criterion.measure is Measure.EDGE:
-            extent = _extent(kind, values, np.eye(3)[..., None] * np.ones(len(tiles)))
+            extent = _extent(kind.hull, values, np.eye(3)[..., None] * np.ones(len(tiles)))
             return np.hypot(extent, height_range) <= limit
         # The displacement uses up a part of the limit.
         limit = limit - height_range
         # Tiles that fit into the limit as a whole: the only test for tiles that are folded or have no normal.
         fits = (np.linalg.norm(upper - lower, axis=0) <= limit) & self.scheme.has_convex_rules
         axis, extent = axis_across(corners), np.full(len(tiles), np.inf)
-        tested = np.flatnonzero(~fits & axis.any(axis=0))
-        extent[tested] = _extent(kind, values.take(tested, axis=2), axis[None].take(tested, axis=2))
-        is_flat = fits | (extent <= limit)
+        is_flat, has_axis = fits.copy(), axis.any(axis=0)
+        for hull in kind.hulls:
+            tested = np.flatnonzero(~is_flat & has_axis)
+            extent[tested] = _extent(hull, values.take(tested, axis=2), axis[None].take(tested, axis=2))
+            is_flat[tested] = extent[tested] <= limit[tested]
         # Tiles whose control faces are folded along the axis need a bound of their normals.
         folded = np.flatnonzero(is_flat & ~fits)
         folded = folded[_are_folded(kind, ring.take(folded, axis=2), axis.take(folded, axis=1))]
@@ -151,11 +153,14 @@ class TileRates:
             is_flat[inner] = (normals.sine < 1) & (extent[inner] <= coarse_limit - height_range[inner])
         for side, (begin, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
             featured = np.flatnonzero(is_flat & ~fits & (tiles["sides"][:, side] > 0))
-            hull = kind.side_hulls[side] if len(featured) else None
-            if hull is None:
+            side_hull = kind.side_hulls[side] if len(featured) else None
+            if side_hull is None:
                 is_flat[featured] = False
             else:
-                curve, across = times(hull, values[..., featured]), _normals_to(end[:, featured] - begin[:, featured])
+                curve, across = (
+                    times(side_hull, values[..., featured]),
+                    _normals_to(end[:, featured] - begin[:, featured]),
+                )
                 width = np.hypot(*(np.ptp(dot(curve, direction), axis=0) for direction in across))
                 is_flat[featured] = width <= limit[featured]
         return is_flat
@@ -207,11 +212,11 @@ class TileRates:
         return heights
 
 
-def _extent(kind: DividedTile, values: FloatArray, axes: FloatArray) -> FloatArray:
-    """``(t,)`` upper bounds of the size of the surface over tiles along axes ``(d, 3, t)``; infinite if unknown."""
-    if kind.hull is None:
+def _extent(hull: FloatArray | None, values: FloatArray, axes: FloatArray) -> FloatArray:
+    """``(t,)`` sizes of hulls of tiles along axes ``(d, 3, t)``; infinite for unknown hulls."""
+    if hull is None:
         return np.full(values.shape[2], np.inf)
-    extent: FloatArray = np.linalg.norm([np.ptp(times(kind.hull, dot(values, axis)), axis=0) for axis in axes], axis=0)
+    extent: FloatArray = np.linalg.norm([np.ptp(times(hull, dot(values, axis)), axis=0) for axis in axes], axis=0)
     return extent
 
 
