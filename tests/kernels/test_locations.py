@@ -12,7 +12,8 @@ pytestmark = [pytest.mark.core, pytest.mark.usefixtures("llvm")]
 
 SURFACES = ["hexagon", "valence 2", "crease", "holes", "non-manifold", "loop corner", "doo_sabin mixed torus"]
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
-TRIANGULATED = ["torus", "hexagon", "holes", "loop corner", "doo_sabin mixed torus", *HOLES]
+TRIANGULATED = ["torus", "hexagon", "valence 2", "mixed torus", "half disc of 6", "boundary none", "holes", *HOLES]
+TRIANGULATED += ["loop corner", "loop mixed torus", "doo_sabin mixed torus", "doo_sabin sheet"]
 # Of parameters, after some sums and products; in single precision, half a unit in the last place of one.
 ROUNDING, ROUNDED = 1e-14, 2.0**-24
 # How far beyond an edge parameters are. Of points of a surface of a size of about 3 there; where parameters are
@@ -185,7 +186,7 @@ def made(name, rate):
 
 @pytest.mark.parametrize("name", TRIANGULATED)
 # Even and odd: at odd rates, triangles reach from one corner of a polygon into the next.
-@pytest.mark.parametrize("rate", [1, 2, 3, 4])
+@pytest.mark.parametrize("rate", [1, 2, 3, 4, 5])
 def test_corners_of_triangles_are_vertices(name, rate):
     surface, kernel, table, locations = made(name, rate)
     types, expected = kernel.types, table.apply(surface.cage.positions)[0]

@@ -3,12 +3,14 @@ import pytest
 from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
+from mitsuba_subdivision.schemes.domain import SQUARE, TRIANGLE
 from mitsuba_subdivision.tessellation import UniformGrid
 from patches.closed_cages import SURFACES, cage_of
 
 # Odd and even, each more than once: from here on they differ in numbers only.
 RATES = range(1, 5)
 EVERY_SURFACE = pytest.mark.parametrize(("scheme", "name"), SURFACES)
+ROUNDING = 1e-13
 # At rate 1, faces on both sides of a vertex of valence 2 may have a triangle in common, which meets only itself.
 COLLAPSED = {("catmull_clark", "valence 2", 1), ("catmull_clark", "valence 2 beside triangle", 1)}
 
@@ -72,6 +74,19 @@ def test_sizes_have_their_formulas_and_every_vertex_is_used_by_the_elements_arou
                 assert elements == set(t.face[t.edge == edge].tolist())
             else:
                 assert len(elements) == 1
+
+
+@pytest.mark.parametrize("domain", [SQUARE, TRIANGLE], ids=lambda domain: domain.name)
+def test_triangles_cover_the_domain_once(domain):
+    """Their areas are positive, and add up to that of the domain, as those of a polygon's corner do."""
+    for rate in range(1, 7):
+        both = UniformGrid(domain, Topology(0, np.empty(0, int), np.empty(0, int)), rate).triangle_parameters()
+        # Those of whole elements are cells of the lattice.
+        assert np.ptp(both[0], axis=1).max() <= 1 / rate + ROUNDING
+        for parameters in filter(len, both):
+            areas = np.linalg.det(parameters[:, 1:] - parameters[:, :1]) / 2
+            assert (areas > 0).all()
+            assert areas.sum() == pytest.approx(domain.area, abs=ROUNDING)
 
 
 @pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])

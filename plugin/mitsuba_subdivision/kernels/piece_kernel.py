@@ -308,8 +308,7 @@ class PieceKernel:
             block, is_rest = child - LEVEL_PIECES * self._piece_levels, level == level_count
             control_count = tip_code // CONTROL
             ring = dr.gather(types.index, self._rings, patch, is_deep)
-            row_of_block = dr.fma(block, control_count, block_row)
-            tip = Tip(dr.select(is_deep, control_count, types.index(0)), ring, row_of_block)
+            frames: tuple = ()
             if self._has_frames:
                 frame = tip_code & FRAMES
                 is_uneven = is_deep & (frame == _UNEVEN) & (level >= PIECE_LEVELS) & ~is_rest
@@ -317,7 +316,9 @@ class PieceKernel:
                 # Blocks of the levels and of the rest, the frame at the point, then the frames of uneven levels.
                 first_frame = LEVEL_PIECES * (level_count - self._piece_levels) + 1
                 frame_block = first_frame + dr.select(is_uneven, block + 1, types.index(0))
-                tip = Tip(*tip[:3], dr.fma(frame_block, control_count, block_row), needs_frame, is_uneven)
+                frames = dr.fma(frame_block, control_count, block_row), needs_frame, is_uneven
+            summed_count = dr.select(is_deep, control_count, types.index(0))
+            tip = Tip(summed_count, ring, dr.fma(block, control_count, block_row), *frames)
         numbers = types.row(buffer, self._numbers, number, is_piece)
         a, b, c, d = turn_matrix(domain, types, (turn + quarter) % domain.corner_count)
         return Piece(

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import numpy as np
 
-from ..evaluation import normals
+from ..evaluation.normals import LEAST_EXTENT, TANGENT_ROUNDING
 from ..mesh import ragged
 from ..patches.piece_table import PACKET
 from .algebra import AffineMap, Monomials, unit
@@ -23,9 +23,6 @@ if TYPE_CHECKING:
 # Least divisor when `UnitNormal` divides a tangent by its longest component, so that the cross product neither under-
 # nor overflows. A shorter tangent means that the patch has collapsed to a point or a curve.
 SHORTEST = 1e-30
-# Constants of `evaluation.normals`, by precision.
-TANGENT_ROUNDING = {dr.VarType.Float32: normals.TANGENT_ROUNDING[32], dr.VarType.Float64: normals.TANGENT_ROUNDING[64]}
-LEAST_EXTENT = {dr.VarType.Float32: normals.LEAST_EXTENT[32], dr.VarType.Float64: normals.LEAST_EXTENT[64]}
 
 
 class VertexKernel:
@@ -102,11 +99,11 @@ class _Part:
 
     def __init__(self, types: ArrayTypes, part: VertexPolynomials, controls: IndexBuffer, are_rounded: bool) -> None:
         self._types, self._monomials = types, Monomials(part.powers.tolist())
-        precision = dr.type_v(types.float)
+        bits = 64 if types.is_double else 32
         # Rounding error of the tangents, relative to the extent of the control points; and the least extent, relative
         # to the first control point.
-        self._rounding = types.floats((TANGENT_ROUNDING[precision] * part.tangent_weights)[part.block])
-        self._least_extent = LEAST_EXTENT[precision] if are_rounded else 0
+        self._rounding = types.floats((TANGENT_ROUNDING[bits] * part.tangent_weights)[part.block])
+        self._least_extent = LEAST_EXTENT[bits] if are_rounded else 0
         columns = np.column_stack([part.blocks, ragged.starts(part.blocks[:, 2])])
         self._blocks = WeightBlocks(types, part.weights, columns, controls, part.block, part.patch)
         self._first_run, self._kind, self._first_vertex, self._first_entry, self._offset = map(

@@ -283,6 +283,12 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return product
 
 
+def unit(vectors: FloatArray) -> FloatArray:
+    """``(.., 3, t)`` vectors divided by their lengths; zero vectors stay zero."""
+    length = np.sqrt(dot(vectors, vectors))
+    return vectors / np.where(length > 0, length, 1)[..., None, :]
+
+
 class Cone(NamedTuple):
     """Cones of directions that contain all derivatives by one parameter, or all normals, of parts of patches."""
 
@@ -292,9 +298,7 @@ class Cone(NamedTuple):
 
 def tangent_cone(derivative: FloatArray) -> tuple[Cone, FloatArray]:
     """Cones of derivatives with Bernstein coefficients ``(b, .., 3, t)``, and the least components along their axes."""
-    total = derivative.sum(axis=0)
-    length = np.sqrt(dot(total, total))
-    axis = total / np.where(length > 0, length, 1)[..., None, :]
+    axis = unit(derivative.sum(axis=0))
     along, squared = dot(derivative, axis), dot(derivative, derivative)
     cosine = (along / np.sqrt(np.where(squared > 0, squared, 1))).min(axis=0)
     return Cone(axis, np.where(cosine > 0, np.sqrt(np.maximum(0, 1 - cosine**2)), 1)), along.min(axis=0)

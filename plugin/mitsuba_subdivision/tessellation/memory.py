@@ -8,11 +8,12 @@ from bisect import bisect_right
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from .uniform_grid import UniformGrid
+
 if TYPE_CHECKING:
     from pathlib import Path
 
     from ..patches import PatchTable
-    from .uniform_grid import UniformGrid
 
 # Measured peak memory of a uniform tessellation: bytes per vertex, with its point, normal and two triangles; bytes per
 # weight of a point and two tangents; and temporary copies of the weights of the largest class.
@@ -44,9 +45,11 @@ def require_memory(patches: PatchTable, grid: UniformGrid) -> None:
     available = exceeded_limit(needed)
     if available is None:
         return
-    fits = bisect_right(
-        range(1, grid.rate), available, key=lambda rate: bytes_of_tessellation(patches, grid.at_rate(rate))
-    )
+
+    def needed_at(rate: int) -> int:
+        return bytes_of_tessellation(patches, UniformGrid(grid.domain, grid.topology, rate))
+
+    fits = bisect_right(range(1, grid.rate), available, key=needed_at)
     raise MemoryError(
         f"tessellation rate {grid.rate} needs about {needed / 1e9:.3g} GB, and {available / 1e9:.3g} GB are available; "
         + (f"expected at most {fits}" if fits else "not even a rate of 1 fits")

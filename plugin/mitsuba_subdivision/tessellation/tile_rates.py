@@ -28,6 +28,7 @@ from .criterion import (
     normal_cone,
     rounded_up,
     tangent_cone,
+    unit,
 )
 
 # Most triangles of a piece, or segments on a feature edge, above which the piece is divided, because its parts have
@@ -135,7 +136,8 @@ class TileRates:
         limit = limit - height_range
         # Tiles that fit into the limit as a whole: the only test for tiles that are folded or have no normal.
         fits = (np.linalg.norm(upper - lower, axis=0) <= limit) & self.scheme.has_convex_rules
-        axis, extent = axis_across(corners), np.full(len(tiles), np.inf)
+        # Across the tile: orthogonal to both diagonals of a quadrilateral, or to two sides of a triangle.
+        axis, extent = unit(cross(corners[2] - corners[0], corners[-1] - corners[1])), np.full(len(tiles), np.inf)
         is_flat, has_axis = fits.copy(), axis.any(axis=0)
         for hull in kind.hulls:
             tested = np.flatnonzero(~is_flat & has_axis)
@@ -198,14 +200,10 @@ class TileRates:
         if displacement is None:
             return None
         steps = HEIGHT_SAMPLES - 1
-        row, column = np.indices((HEIGHT_SAMPLES,) * 2).reshape(2, -1)
-        if self._corner_count == 3:
-            is_inside = row + column <= steps
-            row, column = row[is_inside], column[is_inside]
-        u, v = column / steps, row / steps
-        tile = np.tile(np.arange(len(tiles)), len(u))
+        column, row = self.scheme.domain.indices(steps).T
+        tile = np.tile(np.arange(len(tiles)), len(row))
         corner = tiles["corner"][tile].astype(np.int64)
-        uv = in_patch(tiles, tile, np.repeat([u, v], len(tiles), axis=1))
+        uv = in_patch(tiles, tile, np.repeat([column / steps, row / steps], len(tiles), axis=1))
         uv *= self.frames.scale[self.frames.topology.face[corner]]
         heights = np.full((HEIGHT_SAMPLES, HEIGHT_SAMPLES, len(tiles)), np.nan)
         heights[row, column] = displacement.heights(corner, uv.T).reshape(len(row), -1)
@@ -246,23 +244,12 @@ def _are_folded(kind: DividedTile, ring: FloatArray, axis: FloatArray) -> NDArra
     return are_folded
 
 
-def axis_across(corners: FloatArray) -> FloatArray:
-    """``(3, t)`` unit normals of tiles with corners ``(m, 3, t)``; zero if undefined.
-
-    They are orthogonal to both diagonals of a quadrilateral, or to two sides of a triangle.
-    """
-    axis = cross(corners[2] - corners[0], corners[-1] - corners[1])
-    length = np.linalg.norm(axis, axis=0)
-    return axis / np.where(length > 0, length, 1)
-
-
 def _normals_to(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Two unit vectors ``(3, t)`` orthogonal to each vector and to each other; any two for a zero vector."""
-    length = np.linalg.norm(vectors, axis=0)
-    direction = np.where(length > 0, vectors / np.where(length > 0, length, 1), np.array([[0.0], [0], [1]]))
+    direction = unit(vectors)
+    direction = np.where(dot(direction, direction) > 0, direction, np.array([[0.0], [0], [1]]))
     # The first is orthogonal to the axis along which the direction is smallest.
-    first = cross(direction, np.eye(3)[np.argmin(np.abs(direction), axis=0)].T)
-    first /= np.linalg.norm(first, axis=0)
+    first = unit(cross(direction, np.eye(3)[np.argmin(np.abs(direction), axis=0)].T))
     return first, cross(direction, first)
 
 
@@ -304,5 +291,4 @@ def _element_normals(patches: PatchTable, points: FloatArray) -> FloatArray:
     if patches.scheme.element == "vertex":
         corner_normals, t = normals[:, t.face[patches.half_edge_of_corner]], patches.elements
         normals = np.stack([np.bincount(t.face, x, t.face_count) for x in corner_normals])
-    length: FloatArray = np.sqrt(dot(normals, normals))
-    return normals / np.where(length > 0, length, 1)
+    return unit(normals)

@@ -405,10 +405,6 @@ class UniformGrid:
 
     # Other grids
 
-    def at_rate(self, rate: int) -> UniformGrid:
-        """A grid of another rate over the same elements."""
-        return UniformGrid(self.domain, self.topology, rate)
-
     def cut(self, topology: Topology) -> UniformGrid:
         """The same triangles over elements with the same half-edges, cut along more edges.
 
