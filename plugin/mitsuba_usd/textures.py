@@ -7,6 +7,7 @@ import zipfile
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -282,20 +283,12 @@ def _procedural_wrap(expression: NodeContents) -> str:
 
 def _looked_up(values: Values, uv: Values, wrap: str) -> Values:
     """Bilinear interpolation at ``(..., 2)``, whose v points up."""
+    from scipy.ndimage import map_coordinates
+
     height, width = values.shape[:2]
-    x, y = uv[..., 0] * width - 0.5, (1 - uv[..., 1]) * height - 0.5
-    column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
-    s, t = (x - column)[..., None].astype(np.float32), (y - row)[..., None].astype(np.float32)
-    columns = [_wrapped(column + i, width, wrap) for i in (0, 1)]
-    rows = [_wrapped(row + j, height, wrap) for j in (0, 1)]
-    upper, lower = (values[line, columns[0]] * (1 - s) + values[line, columns[1]] * s for line in rows)
-    return upper * (1 - t) + lower * t
-
-
-def _wrapped(index: NDArray[np.int64], count: int, wrap: str) -> NDArray[np.int64]:
-    if wrap == "repeat":
-        return index % count
-    if wrap == "mirror":
-        index = index % (2 * count)
-        return np.minimum(index, 2 * count - 1 - index)
-    return np.clip(index, 0, count - 1)
+    # At least a row of places, also where all are one.
+    x, y = np.moveaxis(np.atleast_2d(uv), -1, 0)
+    places = (1 - y) * height - 0.5, x * width - 0.5
+    modes: dict[str, Any] = {"repeat": "grid-wrap", "mirror": "reflect", "clamp": "nearest"}
+    mode = modes[wrap]
+    return np.stack([map_coordinates(part, places, order=1, mode=mode) for part in np.moveaxis(values, -1, 0)], axis=-1)

@@ -206,14 +206,19 @@ def test_heights_become_normals(monkeypatch):
     np.testing.assert_allclose(found[32, 32] * 2 - 1, np.array([-1, 0, 1]) / np.sqrt(2), atol=1e-3)
 
 
-def test_lookups_of_a_linear_image_are_linear(np_rng):
+def test_lookups_of_a_linear_image_are_linear_and_continue_beyond_it(np_rng):
     """Between the centres of its pixels; v points up."""
     y, x = np.indices((5, 7))
     values = (2 * x + 3 * y).astype(np.float64)[..., None]
     column, row = np_rng.uniform(0, [6, 4], (50, 2)).T
     uv = np.stack([(column + 0.5) / 7, 1 - (row + 0.5) / 5], axis=1)
-    found = textures._looked_up(values, uv, "clamp")
-    np.testing.assert_allclose(found[:, 0], 2 * column + 3 * row, rtol=0, atol=1e-5)
+    looked_up = textures._looked_up(values, uv, "clamp")
+    np.testing.assert_allclose(looked_up[:, 0], 2 * column + 3 * row, rtol=0, atol=1e-5)
+    uv = np_rng.uniform(0, 1, (50, 2))
+    for wrap, beyond in (("repeat", np.add(uv, [1, -2])), ("mirror", [2, 0] - uv)):
+        at_once = textures._looked_up(values, np.stack([uv, beyond]), wrap)
+        np.testing.assert_allclose(at_once[0], at_once[1], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(textures._looked_up(values, np.array([5.0, -3.0]), "clamp"), [[24]], rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("noise", ["noise2d", "fractal2d", "cellnoise2d"])
