@@ -28,7 +28,7 @@ def write(folder, text, name="stage.usda", up="Z", head=""):
 
 def prim(kind, name, *body, apis=(), head=""):
     """A prim; each part of its body is one statement or several."""
-    schemas = ", ".join(f'"{each}"' for each in apis)
+    schemas = ", ".join(f'"{api}"' for api in apis)
     head = f"prepend apiSchemas = [{schemas}]\n{head}" if apis else head
     return "\n".join([f'def {kind} "{name}" (\n{head}\n) {{', *body, "}\n"])
 
@@ -87,6 +87,7 @@ def told(call, *given, **options):
     """What a call returns, and the messages of its warnings, all of which must be about cages."""
     with warnings.catch_warnings(record=True) as record:
         warnings.simplefilter("always")
-        found = call(*given, **options)
-    assert all(issubclass(each.category, CageWarning) for each in record), [str(each.message) for each in record]
-    return found, [str(each.message) for each in record]
+        result = call(*given, **options)
+    messages = [str(warning.message) for warning in record]
+    assert all(issubclass(warning.category, CageWarning) for warning in record), messages
+    return result, messages

@@ -72,8 +72,8 @@ def material(path):
     """The only material of a stage, which is read without a warning."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", CageWarning)
-        (found,) = StageReader(path).at().materials
-    return found
+        (contents,) = StageReader(path).at().materials
+    return contents
 
 
 RED = document(given("base_color", "color3", value="0.8, 0.1, 0.05"), given("specular_roughness", "float", value="0.4"))
@@ -85,8 +85,8 @@ def test_documents_are_found_by_reference_and_layers_stay_as_they_are(stage, tmp
     layer = Sdf.Layer.FindOrOpen(str(path))
     layer.comment = "unsaved"
     before = layer.ExportToString()
-    found = material(path)
-    assert [*found.inputs["base_color"], found.inputs["roughness"]] == pytest.approx([0.8, 0.1, 0.05, 0.4])
+    paint = material(path)
+    assert [*paint.inputs["base_color"], paint.inputs["roughness"]] == pytest.approx([0.8, 0.1, 0.05, 0.4])
     assert (layer.ExportToString(), layer.dirty) == (before, True)
     assert layer.GetCompositionAssetDependencies() == ["red.mtlx"]
     assert Sdf.Layer.Find(str(tmp_path / "red.mtlx")) is None
@@ -109,8 +109,8 @@ def test_warnings_keep_their_kind_and_are_given_before_an_error(stage, monkeypat
     monkeypatch.setattr(reader, "_contents", read)
     with pytest.warns() as caught, pytest.raises(CageError, match="unusable"):
         reader.at()
-    found = {each.category: str(each.message) for each in caught}
-    assert found == {RuntimeWarning: "overflow", CageWarning: "the stage is odd"}
+    told_of = {warning.category: str(warning.message) for warning in caught}
+    assert told_of == {RuntimeWarning: "overflow", CageWarning: "the stage is odd"}
 
 
 def test_variants_and_instances_have_their_documents(tmp_path):
@@ -131,9 +131,10 @@ def test_variants_and_instances_have_their_documents(tmp_path):
     contents = StageReader(write(tmp_path, "".join(pieces))).at()
     assert (len(contents.instances), len(contents.groups)) == (4, 2)
     placed = sorted(contents.instances, key=lambda instance: instance.to_world[0, 3])
-    found = [contents.materials[contents.groups[each.group][0].material].inputs["base_color"] for each in placed]
-    np.testing.assert_allclose(found[:2], [[0.8, 0.1, 0.05], [0.1, 0.2, 0.9]], rtol=1e-6)
-    assert found[2:] == found[:2]
+    materials = [contents.materials[contents.groups[instance.group][0].material] for instance in placed]
+    colors = [material.inputs["base_color"] for material in materials]
+    np.testing.assert_allclose(colors[:2], [[0.8, 0.1, 0.05], [0.1, 0.2, 0.9]], rtol=1e-6)
+    assert colors[2:] == colors[:2]
 
 
 GRAPH = """<nodegraph name="NG">
@@ -165,8 +166,8 @@ def test_graphs_are_expressions_and_affine_mappings_are_those_of_pictures(stage,
     picture(tmp_path / "color.png")
     picture(tmp_path / "normal.png", [128, 128, 255])
     text = document(*USED, graph=GRAPH).replace("<materialx ", '<materialx fileprefix="./" ')
-    found = material(stage(text))
-    color, normal, rough = (found.inputs[name] for name in ("base_color", "normal", "roughness"))
+    paint = material(stage(text))
+    color, normal, rough = (paint.inputs[name] for name in ("base_color", "normal", "roughness"))
     assert isinstance(color, TextureContents)
     assert (color.file, color.color_space) == (str(tmp_path / "color.png"), "sRGB")
     assert color.scale[:3] == [0.5, 1.0, 1.0]
@@ -174,7 +175,7 @@ def test_graphs_are_expressions_and_affine_mappings_are_those_of_pictures(stage,
     np.testing.assert_allclose(color.to_uv @ [1, 1, 1], [2 - 0.5, 3, 1])
     assert (normal.color_space, normal.scale[:3], normal.bias[:3]) == ("raw", [1, 1, 2], [-0.5, -0.5, -1])
     assert isinstance(rough, NodeContents)
-    assert (rough.category, found.texcoords()) == ("noise2d", ["st"])
+    assert (rough.category, paint.texcoords()) == ("noise2d", ["st"])
     bsdf = msub.usd_scene(stage(text, SMOOTH_SQUARE), mi)["Looks_Red"]["bsdf"]
     assert (bsdf["type"], bsdf["bsdf"]["roughness"]["type"]) == ("normalmap", "bitmap")
     values = np.array(bsdf["bsdf"]["base_color"]["bitmap"])
@@ -206,9 +207,9 @@ def test_a_picture_at_constant_coordinates_is_one_texel(stage, tmp_path):
     picture(tmp_path / "color.png")
     where = given("texcoord", "vector2", value="0.25, 0.75")
     graph = element("image", "spot", "color3", given("file", "filename", value="color.png"), where)
-    found = material(stage(document(given("base_color", "color3", nodename="spot"), graph=graph)))
+    paint = material(stage(document(given("base_color", "color3", nodename="spot"), graph=graph)))
     for uv in ((0, 0), (0.5, 2)):
-        np.testing.assert_array_equal(found.inputs["base_color"].to_uv @ [*uv, 1], [0.25, 0.75, 1])
+        np.testing.assert_array_equal(paint.inputs["base_color"].to_uv @ [*uv, 1], [0.25, 0.75, 1])
 
 
 def test_tiles_lie_beside_the_layer_that_names_them(tmp_path):
@@ -247,9 +248,9 @@ TWICE = [given("specular_roughness", "float", nodename="d0"), given("metalness",
     ids=["nodes of the document", "outputs of a node"],
 )
 def test_graphs_of_constants_are_computed(stage, graph, inputs, expected):
-    found = material(stage(document(*inputs, graph=graph))).inputs
+    inputs_of = material(stage(document(*inputs, graph=graph))).inputs
     for name, value in expected.items():
-        np.testing.assert_allclose(found[name], value, rtol=1e-6)
+        np.testing.assert_allclose(inputs_of[name], value, rtol=1e-6)
 
 
 @pytest.mark.core
@@ -264,12 +265,12 @@ def test_networks_inside_a_stage(tmp_path):
     text = network("open_pbr_surface", inputs, "float inputs:amount = 0.25", nodes)
     tone = 'color3f[] primvars:tone = [(0.1, 0.2, 0.3)] (interpolation = "constant")'
     path = write(tmp_path, text.replace("rel material", f"{tone}\nrel material"))
-    found = material(path)
+    paint = material(path)
     # (in - 0.5) * amount + 0.5
-    assert found.inputs.get("roughness", 0.5) == pytest.approx(0.0, abs=1e-7)
-    assert isinstance(color := found.inputs["base_color"], PrimvarContents)
+    assert paint.inputs.get("roughness", 0.5) == pytest.approx(0.0, abs=1e-7)
+    assert isinstance(color := paint.inputs["base_color"], PrimvarContents)
     assert color.name == "tone"
-    (entry,) = (each for each in msub.usd_scene(path, mi).values() if getattr(each, "bsdf", None))
+    (entry,) = (shape for shape in msub.usd_scene(path, mi).values() if getattr(shape, "bsdf", None))
     np.testing.assert_allclose(mi.traverse(entry)["bsdf.brdf_0.base_color.value"], [[0.1], [0.2], [0.3]], rtol=1e-5)
 
 
@@ -278,9 +279,9 @@ def test_colours_are_linear_unless_their_space_is_that_of_srgb(stage, space, is_
     color = np.array([0.5, 0.2, 0.8])
     path = stage(document(given("base_color", "color3", value="0.5, 0.2, 0.8", colorspace=space)))
     contents, messages = told(StageReader(path).at)
-    assert ["colour space" in each for each in messages] == [True] * (space == "acescg")
+    assert ["colour space" in message for message in messages] == [True] * (space == "acescg")
     expected = ((color + 0.055) / 1.055) ** 2.4 if is_srgb else color
-    np.testing.assert_allclose([each.inputs["base_color"] for each in contents.materials], [expected], rtol=1e-6)
+    np.testing.assert_allclose([paint.inputs["base_color"] for paint in contents.materials], [expected], rtol=1e-6)
 
 
 def test_packages_hold_documents_and_their_pictures(tmp_path):
@@ -320,7 +321,7 @@ TOLD = [
 def test_what_cannot_be_had_is_told_once(stage, text, message):
     path = stage(text, RED_SQUARE + RED_SQUARE.replace('"square"', '"other"'))
     _, messages = told(StageReader(path).at)
-    assert sum(message in each for each in messages) == 1
+    assert sum(message in warning for warning in messages) == 1
 
 
 ADDRESSES = 'string inputs:uaddressmode = "{0}"\nstring inputs:vaddressmode = "{0}"'
@@ -356,9 +357,9 @@ def test_inputs_of_images_and_coordinates_that_are_ignored_are_told_once_by_name
     nodes = shader("image", node, inputs, image, "color3f outputs:out") + shader("where", *where, "float2 outputs:out")
     nodes += shader("tone", "ND_geompropvalue_color3", 'string inputs:geomprop = "tone"', "color3f outputs:out")
     text = network("standard_surface", "color3f inputs:base_color.connect = </Red/image.outputs:out>", nodes)
-    found, messages = told(StageReader(write(tmp_path, text)).at)
-    assert [message in each for each in messages] == [True]
-    assert [each.file for each in found.materials[0].textures()] == [str(tmp_path / "black.png")]
+    contents, messages = told(StageReader(write(tmp_path, text)).at)
+    assert [message in warning for warning in messages] == [True]
+    assert [picture.file for picture in contents.materials[0].textures()] == [str(tmp_path / "black.png")]
 
 
 @pytest.mark.parametrize(("place", "is_told"), [("texcoord", False), ("place2d", True)])
@@ -372,14 +373,15 @@ def test_slopes_along_other_coordinates_are_told(stage, tmp_path, place, is_told
         <normalmap name="n" type="vector3"><input name="in" type="vector3" nodename="h" /></normalmap>"""
     picture(tmp_path / "black.png", 0)
     _, messages = told(StageReader(stage(document(given("normal", "vector3", nodename="n"), graph=bump))).at)
-    assert ["texcoord of heighttonormal is ignored; slopes are along" in each for each in messages] == [True] * is_told
+    told_of = ["texcoord of heighttonormal is ignored; slopes are along" in message for message in messages]
+    assert told_of == [True] * is_told
 
 
 def test_inputs_of_other_types(tmp_path):
     """Words in place of numbers are as if they were not there; too few numbers are no colour."""
     words = 'string inputs:specular_roughness = "rough"\n'
-    found = material(write(tmp_path, network("standard_surface", words)))
-    assert found.inputs["roughness"] == pytest.approx(0.2)
+    paint = material(write(tmp_path, network("standard_surface", words)))
+    assert paint.inputs["roughness"] == pytest.approx(0.2)
     path = write(tmp_path, network("standard_surface", f"{words}float2 inputs:base_color = (1, 0)"))
     with pytest.warns(CageWarning, match="inputs have other types"):
         assert StageReader(path).at().materials == []
@@ -406,8 +408,8 @@ def test_light_fades_on_its_way_through_a_body(stage, scheme):
     path = stage(glass, VIEW + mesh("square", head, BOX, SHARP, bound("Looks/Red")))
     scene = msub.usd_scene(path, mi, size=(8, 8), spp=1024)
     assert scene["integrator"]["type"] == "volpath"
-    found = np.array(mi.render(mi.load_dict(scene)))
-    np.testing.assert_allclose(found.mean(axis=(0, 1)), np.array([0.25, 0.5, 0.81]) ** 2, rtol=0.03)
+    image = np.array(mi.render(mi.load_dict(scene)))
+    np.testing.assert_allclose(image.mean(axis=(0, 1)), np.array([0.25, 0.5, 0.81]) ** 2, rtol=0.03)
 
 
 NO_SPECULAR, GEOMCOLOR = given("specular", "float", value="0"), element("geomcolor", "tone", "color3")
@@ -424,5 +426,5 @@ TONE = "color3f[] primvars:displayColor = [(0.25, 0.5, 0.75)]"
 def test_surfaces_have_the_colours_of_the_material_or_of_the_mesh(stage, red, more, expected):
     """A furnace: a square that reflects a part of a white sky."""
     path = stage(red, VIEW + mesh("square", SQUARE, more, bound("Looks/Red")))
-    found = np.array(mi.render(mi.load_dict(msub.usd_scene(path, mi, size=(8, 8), spp=256))))
-    np.testing.assert_allclose(found.mean(axis=(0, 1)), expected, rtol=0.02)
+    image = np.array(mi.render(mi.load_dict(msub.usd_scene(path, mi, size=(8, 8), spp=256))))
+    np.testing.assert_allclose(image.mean(axis=(0, 1)), expected, rtol=0.02)

@@ -115,8 +115,8 @@ def _perlin(x, y):
 
 def test_noises_are_those_of_open_shading_language():
     points = np.random.default_rng(2).uniform(-20, 20, (50, 2))
-    found = evaluate(node("noise2d", "float", amplitude=2.0, pivot=0.5, texcoord=UV), points)
-    np.testing.assert_allclose(found[..., 0], [2 * _perlin(*p) + 0.5 for p in points], atol=1e-12)
+    noise = evaluate(node("noise2d", "float", amplitude=2.0, pivot=0.5, texcoord=UV), points)
+    np.testing.assert_allclose(noise[..., 0], [2 * _perlin(*p) + 0.5 for p in points], atol=1e-12)
     fractal = node("fractal2d", "float", amplitude=1.0, octaves=3.0, lacunarity=2.0, diminish=0.5, texcoord=UV)
     expected = [sum(0.5**k * _perlin(*(p * 2**k)) for k in range(3)) for p in points]
     np.testing.assert_allclose(evaluate(fractal, points)[..., 0], expected, atol=1e-12)
@@ -132,8 +132,8 @@ def test_distances_of_worley_noise_are_to_the_nearest_of_random_points():
     """Without jitter, the points are the centres of the unit squares."""
     points = np.random.default_rng(3).uniform(-5, 5, (40, 2))
     given = {"texcoord": UV, "jitter": 0.0, "style": 0.0}
-    found = evaluate(node("worleynoise2d", "float", **given), points)[..., 0]
-    np.testing.assert_allclose(found, np.linalg.norm(points - np.floor(points) - 0.5, axis=1), atol=1e-12)
+    distances = evaluate(node("worleynoise2d", "float", **given), points)[..., 0]
+    np.testing.assert_allclose(distances, np.linalg.norm(points - np.floor(points) - 0.5, axis=1), atol=1e-12)
 
 
 def test_a_picture_times_a_colour_stays_a_picture():
@@ -196,14 +196,14 @@ def test_heights_become_normals(monkeypatch):
         # A picture that is repeated is steeper.
         tiled = picture("r", to_uv=np.diag([repeats, 1.0, 1.0]))
         expression = NodeContents("heighttonormal", "vector3", {"in": tiled, "scale": 16.0})
-        found = baked(expression, source({"a.png": height}))[0]
+        normals = baked(expression, source({"a.png": height}))[0]
         expected = np.array([-repeats, 0, 1]) / np.sqrt(1 + repeats**2)
-        np.testing.assert_allclose(found[32, 32] * 2 - 1, expected, atol=1e-3)
+        np.testing.assert_allclose(normals[32, 32] * 2 - 1, expected, atol=1e-3)
     one = node("ramplr", "float", valuel=1.0, valuer=1.0, texcoord=UV)
     varying = node("multiply", "float", in1=picture("r"), in2=one)
     expression = NodeContents("heighttonormal", "vector3", {"in": varying, "scale": 16.0})
-    found = baked(expression, source({"a.png": height}))[0]
-    np.testing.assert_allclose(found[32, 32] * 2 - 1, np.array([-1, 0, 1]) / np.sqrt(2), atol=1e-3)
+    normals = baked(expression, source({"a.png": height}))[0]
+    np.testing.assert_allclose(normals[32, 32] * 2 - 1, np.array([-1, 0, 1]) / np.sqrt(2), atol=1e-3)
 
 
 def test_lookups_of_a_linear_image_are_linear_and_continue_beyond_it(np_rng):

@@ -30,8 +30,8 @@ def _shape(cage, matrix=None, name="/shape"):
 
 
 def _segments(contents, sensor, shading):
-    found = segments_of(contents, Surfaces(), outline_for(sensor), sensor["near_clip"], shading)
-    return {shape: of_copies.max() for shape, of_copies in found.items()}
+    segments = segments_of(contents, Surfaces(), outline_for(sensor), sensor["near_clip"], shading)
+    return {shape: of_copies.max() for shape, of_copies in segments.items()}
 
 
 def _rate(shape, sensor, shading="exact"):
@@ -74,7 +74,7 @@ def test_triangles_are_as_near_as_the_picture_shows_and_not_much_nearer(columns,
 @pytest.mark.core
 def test_segments_follow_the_size_in_the_picture():
     cage = named_cages.torus(8, 5)
-    near, far, larger = (_rate(_shape(cage), each) for each in (sensor_at(8), sensor_at(80), sensor_at(8, 2560)))
+    near, far, larger = (_rate(_shape(cage), sensor) for sensor in (sensor_at(8), sensor_at(80), sensor_at(8, 2560)))
     assert far < near < larger
     # Around the camera, a picture may show any part from near.
     assert _rate(_shape(cage), sensor_at(0)) == FINEST_RATE
@@ -101,14 +101,14 @@ def test_still_pictures_have_adaptive_triangles_where_these_are_fewer():
     shape, group, dense = _shape(cage), _shape(cage, name="/group"), _shape(named_cages.torus(300, 200))
     contents = scene_of(shape, dense, groups=[[group]], instances=[InstanceContents("/i", 0, np.eye(4))])
     segments = _segments(contents, sensor, "exact")
-    found = _triangles(contents, sensor)
+    triangles = _triangles(contents, sensor)
     expected = {**outline_for(sensor), "max_rate": FINEST_RATE}
-    assert {**found[shape], "sensor_to_world": None} == {**expected, "sensor_to_world": None}
+    assert {**triangles[shape], "sensor_to_world": None} == {**expected, "sensor_to_world": None}
     assert segments[dense] == 1
-    assert found[dense] == {"tessellation_rate": 1}
+    assert triangles[dense] == {"tessellation_rate": 1}
     # Instances are seen from several sides, and displaced surfaces have unknown outlines.
-    assert found[group] == {"tessellation_rate": min(segments[group], 8)}
-    assert _triangles(contents, sensor, displacement="vertex_height")[shape] == found[group]
+    assert triangles[group] == {"tessellation_rate": min(segments[group], 8)}
+    assert _triangles(contents, sensor, displacement="vertex_height")[shape] == triangles[group]
     assert _triangles(contents, sensor, tessellation_rate=2)[group] == {"tessellation_rate": 2}
     assert set(_triangles(contents, sensor, "vertex")[shape]) == {"tessellation_rate"}
     # A few uniform triangles need no choice.
@@ -192,9 +192,9 @@ def rates_of(shape):
 
 def test_copies_of_one_rate_are_one_shape():
     shape, alone = ShapeContents("/cube", cube(), np.eye(4)), ShapeContents("/alone", cube(), np.eye(4))
-    found, rates = with_copies(scene([alone], [shape]), rates_of(shape), "exact", StageWarnings())
-    first, many, few = found.shapes
-    assert (found.groups, found.instances, first) == ([], [], alone)
+    contents, rates = with_copies(scene([alone], [shape]), rates_of(shape), "exact", StageWarnings())
+    first, many, few = contents.shapes
+    assert (contents.groups, contents.instances, first) == ([], [], alone)
     assert (rates[many], rates[few], len(few.cage.face_sizes)) == (1, 3, 6 * 10)
     expected = [POINTS * [1, 2, 1] + [number, 0, 0] for number in range(10)]
     np.testing.assert_allclose(few.cage.positions, np.concatenate(expected))
@@ -213,8 +213,8 @@ def test_copies_of_a_part_show_its_faces_only():
 @pytest.mark.parametrize("faces", [FACES[:1], FACES[:2]])
 def test_copies_of_few_faces_are_one_shape(faces):
     sheet = CageContents(POINTS, np.full(len(faces), 4), np.concatenate(faces), scheme="catmull_clark")
-    found = joined(scene(group=[ShapeContents("/sheet", sheet, np.eye(4))]))
-    assert [len(each.cage.face_sizes) for each in found] == [len(faces) * COUNT]
+    shapes = joined(scene(group=[ShapeContents("/sheet", sheet, np.eye(4))]))
+    assert [len(shape.cage.face_sizes) for shape in shapes] == [len(faces) * COUNT]
 
 
 @pytest.mark.parametrize("shading", ["vertex", "exact"])
@@ -254,15 +254,15 @@ def test_copies_that_are_no_instances_are_one_shape_too():
     cage = cube(None, attributes=attributes)
     mirrored = np.diag([-1.0, 1, 1, 1])
     shapes = [ShapeContents(f"/c{k}", cage, mirrored @ placed(k) if k else placed(k)) for k in range(COUNT)]
-    (found,) = joined(scene(shapes, count=0))
-    heat, paint = (found.cage.attributes[name] for name in ("heat", "paint"))
+    (copied,) = joined(scene(shapes, count=0))
+    heat, paint = (copied.cage.attributes[name] for name in ("heat", "paint"))
     np.testing.assert_array_equal(heat.values.ravel(), np.tile(np.arange(8.0), COUNT))
     # Faces of mirrored copies are turned over, with what their corners have.
     corners = np.concatenate(FACES)
     at_vertices = dict(zip(zip(np.arange(24) // 4, corners, strict=True), np.arange(24.0), strict=True))
-    vertices = found.cage.face_vertices[24:48] - 8
+    vertices = copied.cage.face_vertices[24:48] - 8
     values = paint.values[paint.indices[24:48], 0]
-    assert [at_vertices[each] for each in zip(np.arange(24) // 4, vertices, strict=True)] == values.tolist()
+    assert [at_vertices[place] for place in zip(np.arange(24) // 4, vertices, strict=True)] == values.tolist()
 
 
 def strip(faces):
@@ -275,12 +275,12 @@ def strip(faces):
 def test_large_copies_are_shapes_of_their_own_that_share_a_cage(monkeypatch):
     shape = ShapeContents("/strip", strip(LARGE), 2 * np.eye(4))
     contents = scene(group=[shape])
-    found = with_large_copies(contents)
-    assert (found.groups, found.instances) == ([[]], [])
-    assert [each.name for each in found.shapes[:2]] == ["/i0/strip", "/i1/strip"]
-    assert all(each.cage is shape.cage for each in found.shapes)
-    np.testing.assert_array_equal([each.to_world for each in found.shapes], [2 * placed(k) for k in range(COUNT)])
-    assert with_copies(found, {}, "exact", StageWarnings()) == (found, {})
+    separate = with_large_copies(contents)
+    assert (separate.groups, separate.instances) == ([[]], [])
+    assert [copy.name for copy in separate.shapes[:2]] == ["/i0/strip", "/i1/strip"]
+    assert all(copy.cage is shape.cage for copy in separate.shapes)
+    np.testing.assert_array_equal([copy.to_world for copy in separate.shapes], [2 * placed(k) for k in range(COUNT)])
+    assert with_copies(separate, {}, "exact", StageWarnings()) == (separate, {})
     monkeypatch.setattr(copies, "MOST_BYTES", copies.TRIANGLE_BYTES * 2 * LARGE * COUNT - 1)
     assert with_large_copies(contents) is contents
 

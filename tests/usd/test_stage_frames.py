@@ -49,28 +49,28 @@ def alone(path, time):
 
 def recorded(monkeypatch, module, name):
     """What a function of a module is called with from now on."""
-    found, call = [], getattr(module, name)
-    monkeypatch.setattr(module, name, lambda *given, **more: found.append((given, more)) or call(*given, **more))
-    return found
+    calls, call = [], getattr(module, name)
+    monkeypatch.setattr(module, name, lambda *given, **more: calls.append((given, more)) or call(*given, **more))
+    return calls
 
 
 def frames(path, times):
     return [pixels(loaded) for loaded in frame_range(path, range(1, 6, 2)).frames(times, "box")]
 
 
-def assert_each_is_as_alone(path, times, found):
-    for time, picture in zip(times, found, strict=True):
+def assert_each_is_as_alone(path, times, pictures):
+    for time, picture in zip(times, pictures, strict=True):
         np.testing.assert_allclose(picture, alone(path, time), atol=1e-4)
-    assert np.abs(found[0] - found[1]).mean() > 0.01
+    assert np.abs(pictures[0] - pictures[1]).mean() > 0.01
 
 
 def on_film(loaded, points):
     """Where points are on the film, from 0 to 1."""
-    found = mi.Interaction3f()
+    place = mi.Interaction3f()
     places = []
     for point in points:
-        found.p = mi.Point3f(point)
-        places.append(np.array(loaded.sensor.sample_direction(found, mi.Point2f(0))[0].uv).ravel())
+        place.p = mi.Point3f(point)
+        places.append(np.array(loaded.sensor.sample_direction(place, mi.Point2f(0))[0].uv).ravel())
     return np.array(places) / loaded.size
 
 
@@ -99,7 +99,7 @@ def test_turntables_turn_the_stage_before_its_camera(tmp_path, more):
             np.testing.assert_allclose(np.array(lamp.bbox().center()), [-4, -3, 5], atol=1e-5)
         if more == "":
             # Seen from the camera, the studio's light stays where it is.
-            matrices = [mi.traverse(each.scene)["key_light.to_world"].matrix for each in (loaded, first)]
+            matrices = [mi.traverse(frame.scene)["key_light.to_world"].matrix for frame in (loaded, first)]
             centers = np.array(matrices)[:, :3, 3]
             np.testing.assert_allclose(on_film(loaded, centers[:1]), on_film(first, centers[1:]), atol=1e-4)
 
@@ -110,9 +110,9 @@ def test_frames_are_what_each_time_gives_alone(tmp_path, monkeypatch, request, v
     request.getfixturevalue(f"variant_{variant}")
     made = recorded(monkeypatch, scene_entries, "subdivision")
     path, times = write(tmp_path, WHOLE), (1, 3, 5) if variant == "scalar_rgb" else (1, 5)
-    found = frames(path, times)
+    pictures = frames(path, times)
     assert sorted(shape.name for (shape, *_), _ in made) == ["/ball", "/moving", "/still", "/tinted"]
-    assert_each_is_as_alone(path, times, found)
+    assert_each_is_as_alone(path, times, pictures)
 
 
 @scalar
@@ -123,9 +123,9 @@ def test_where_only_the_camera_moves_all_else_is_read_and_loaded_once(tmp_path, 
     lens = f"float focalLength.timeSamples = {{1: 35, 5: 50}}\n{focus}"
     rig = prim("Xform", "rig", RIG, CAMERA.replace("float focalLength = 35", lens))
     path = write(tmp_path, STILL + FLOOR + LAMP.replace(LAMP_MOVES, placed((4, -3, 5))) + rig)
-    found = frames(path, (1, 3, 5))
-    assert [len(each) for each in made] == [1, 1]
-    assert_each_is_as_alone(path, (1, 3, 5), found)
+    pictures = frames(path, (1, 3, 5))
+    assert [len(calls) for calls in made] == [1, 1]
+    assert_each_is_as_alone(path, (1, 3, 5), pictures)
 
 
 @pytest.mark.parametrize("moving", [MOVING, LAMP, INSTANCES, FLYING, prim("Xform", "rig", RIG, STILL)])
@@ -144,9 +144,9 @@ def test_what_changes_from_frame_to_frame_is_shown(tmp_path):
     text += STILL.replace("displayColor = [(.1,.2,.7)]", "displayColor.timeSamples = {1: [(1,0,0)], 5: [(0,1,0)]}")
     moving = frame_range(write(tmp_path, text), range(1, 6, 2))
     scenes = list(moving.frames([1, 3, 5], "box"))
-    shapes = [len(each.scene.shapes()) for each in scenes]
+    shapes = [len(frame.scene.shapes()) for frame in scenes]
     assert shapes[1] == shapes[0] + 1
-    assert len({str(mi.traverse(each.scene)["sensor.to_world"]) for each in scenes}) == 1
+    assert len({str(mi.traverse(frame.scene)["sensor.to_world"]) for frame in scenes}) == 1
     tips = np.array([[-0.2, 0, 2], [4, 0, 0], [3.4, 0.4, 0]])
     assert (np.abs(on_film(scenes[0], tips) - 0.5) < 0.5).all()
     assert np.abs(pixels(scenes[0]) - pixels(scenes[2])).mean() > 0.01
@@ -159,7 +159,7 @@ def test_a_saved_stage_renders_to_the_same_picture(tmp_path, request, variant):
     request.getfixturevalue(f"variant_{variant}")
     path = write(tmp_path, WHOLE)
     written = save_scene(StillPicture(StageScenes(path, LOOK, RATE, time=2)).scene, tmp_path / "saved" / "moving.xml")
-    suffixes = Counter(each.suffix for each in written)
+    suffixes = Counter(path.suffix for path in written)
     assert suffixes == {".obj": 3, ".ply": 2, ".png": 1, ".exr": 2, ".xml": 1}
     np.testing.assert_allclose(pixels(load_scene(written[-1], None, "box")), alone(path, 2), atol=1e-5)
 
@@ -211,7 +211,7 @@ def sides_of_stills(path, times, asked):
     """Of the texture in pictures at some times; nothing is asked for afterwards."""
     for time in times:
         StillPicture(StageScenes(path, LOOK, RATE, time=time))
-    sides = [texture_side(each) for each in asked]
+    sides = [texture_side(entries) for entries in asked]
     asked.clear()
     return sides
 
@@ -252,7 +252,7 @@ def test_textures_are_as_fine_as_the_frame_that_shows_most_of_them_needs(tmp_pat
     if shown == "frames":
         assert [*frame_range(path, range(1, 4)).frames([3, 1], "box")]
         assert sides[0] < max(sides) < TEXTURE_SIDE
-        assert [texture_side(each) for each in asked] == [max(sides)] * 2
+        assert [texture_side(entries) for entries in asked] == [max(sides)] * 2
     else:
         Turntable(StageScenes(path, LOOK, RATE), 4)
         assert texture_side(asked[0]) == sides[0]
@@ -326,10 +326,10 @@ def path(tmp_path):
 
 def surfaces(scene):
     """Limit surfaces of a scene that stand alone, and those in groups."""
-    entries = [each for name, each in scene.items() if isinstance(each, dict) and name != "ground"]
-    groups = [each for each in entries if each["type"] == "shapegroup"]
+    entries = [entry for name, entry in scene.items() if isinstance(entry, dict) and name != "ground"]
+    groups = [entry for entry in entries if entry["type"] == "shapegroup"]
     grouped = [shape for group in groups for name, shape in group.items() if name != "type"]
-    return [each for each in entries if each["type"] == "subdivision"], grouped
+    return [entry for entry in entries if entry["type"] == "subdivision"], grouped
 
 
 @exact
@@ -337,15 +337,15 @@ def surfaces(scene):
 def test_a_still_picture_is_exact_with_outlines_for_its_camera(path, capfd):
     scene = msub.usd_scene(path, mi, size=(1280, 960))
     alone, grouped = surfaces(scene)
-    assert {each["shading"] for each in (*alone, *grouped)} == {"exact"}
-    assert {(each["pixel_error"], each["outline"]) for each in alone} == {(0.1, "sensor")}
-    assert all(each["sensor_to_world"] == scene["sensor"]["to_world"] for each in alone)
-    assert {each["tessellation_rate"] for each in grouped} == {8}
+    assert {entry["shading"] for entry in (*alone, *grouped)} == {"exact"}
+    assert {(entry["pixel_error"], entry["outline"]) for entry in alone} == {(0.1, "sensor")}
+    assert all(entry["sensor_to_world"] == scene["sensor"]["to_world"] for entry in alone)
+    assert {entry["tessellation_rate"] for entry in grouped} == {8}
     assert mi.load_dict(scene).shapes()
     assert capfd.readouterr() == ("", "")
     for given in ({"tessellation_rate": 3}, {"shading": "vertex"}):
         (kept, _), (name, value) = surfaces(msub.usd_scene(path, mi, **given)), *given.items()
-        assert all(each[name] == value and "tessellation" not in each for each in kept)
+        assert all(entry[name] == value and "tessellation" not in entry for entry in kept)
 
 
 @exact
@@ -358,14 +358,14 @@ def test_frames_and_saved_scenes_follow_no_sensor(path):
     ):
         alone, _ = surfaces(shown.scene)
         assert alone
-        assert all(each["shading"] == "exact" and 1 <= each["tessellation_rate"] <= 8 for each in alone)
+        assert all(entry["shading"] == "exact" and 1 <= entry["tessellation_rate"] <= 8 for entry in alone)
 
 
 @scalar
 def test_scalar_variants_have_normals_of_vertices_and_say_so_once(path, tmp_path, capfd):
     automatic, given = (surfaces(msub.usd_scene(path, mi, **more)) for more in ({}, {"shading": "vertex"}))
-    assert [each["tessellation_rate"] for each in automatic[0]] == [each["tessellation_rate"] for each in given[0]]
-    assert {each["shading"] for each in (*automatic[0], *automatic[1])} == {"vertex"}
+    assert [entry["tessellation_rate"] for entry in automatic[0]] == [entry["tessellation_rate"] for entry in given[0]]
+    assert {entry["shading"] for entry in (*automatic[0], *automatic[1])} == {"vertex"}
     out, err = capfd.readouterr()
     message = "normals are interpolated between vertices: exact shading needs a variant of llvm"
     assert (out, err.count(message)) == ("", 1)

@@ -110,9 +110,8 @@ def test_roughness_beyond_1_is_1():
     """Networks of nodes divide by masks, and a roughness of 80,000 shines like a lamp."""
     mask = TextureContents("none.png", "r", "raw", "repeat", [1] * 4, [0] * 4, np.eye(3), "st", [0.00001] * 4)
     for beyond in (5.0, node("divide", "float", in1=0.8, in2=mask)):
-        given = {"degrees": 30, "base_color": COLOR}
-        expected, found = (both("standard_surface", specular_roughness=each, **given) for each in (1.0, beyond))
-        np.testing.assert_allclose(found, expected, rtol=SAMPLED)
+        of_1, of_more = (both("standard_surface", 30, base_color=COLOR, specular_roughness=r) for r in (1.0, beyond))
+        np.testing.assert_allclose(of_more, of_1, rtol=SAMPLED)
 
 
 def test_edges_of_metals_have_the_colour_that_the_models_say():
@@ -126,8 +125,8 @@ def test_edges_of_metals_have_the_colour_that_the_models_say():
     base, factor = np.array(given["base_color"]), np.array([0.95, 0.95, 0.9])
     angle = np.degrees(np.arccos(1 / 7))
     expected = factor * (base + (1 - base) * (6 / 7) ** 5)
-    found = both("open_pbr_surface", angle, specular_color=factor.tolist(), **given)[0]
-    np.testing.assert_allclose(found, expected, atol=0.01)
+    reflected = both("open_pbr_surface", angle, specular_color=factor.tolist(), **given)[0]
+    np.testing.assert_allclose(reflected, expected, atol=0.01)
 
 
 @pytest.mark.parametrize(("model", "color"), [("UsdPreviewSurface", "diffuseColor"), ("gltf_pbr", "base_color")])
@@ -135,8 +134,8 @@ def test_edges_of_metals_turn_to_white_as_slowly_as_schlick_has_it(model, color)
     """A conductor of Gulbrandsen's with a white edge is 0.13 too pale at 75 degrees."""
     for degrees in (0, 45, 60, 75, 82):
         expected = np.array(COPPER) + (1 - np.array(COPPER)) * (1 - np.cos(np.radians(degrees))) ** 5
-        found = both(model, degrees, metallic=1.0, roughness=0.0, **{color: COPPER})[0]
-        np.testing.assert_allclose(found, expected, atol=0.025)
+        reflected = both(model, degrees, metallic=1.0, roughness=0.0, **{color: COPPER})[0]
+        np.testing.assert_allclose(reflected, expected, atol=0.025)
 
 
 def test_edge_colours_below_a_coat_are_only_missed_where_they_are_not_white():
@@ -223,8 +222,8 @@ def test_models_agree_where_they_mean_the_same():
         ("gltf_pbr", "base_color", {"metallic": 0.0, "roughness": 0.4, "ior": 1.6}),
         ("UsdPreviewSurface", "diffuseColor", {"roughness": 0.4, "ior": 1.6}),
     ):
-        found = bsdf_of(model, **given, **{color: COLOR})
-        assert [*found["base_color"]["value"], found["roughness"], found["eta"]] == pytest.approx([*COLOR, 0.4, 1.6])
+        lobe = bsdf_of(model, **given, **{color: COLOR})
+        assert [*lobe["base_color"]["value"], lobe["roughness"], lobe["eta"]] == pytest.approx([*COLOR, 0.4, 1.6])
 
 
 ROUGH_METAL = {"metalness": 1.0, "specular_roughness": 0.5, "specular_anisotropy": 0.75}
@@ -262,18 +261,18 @@ def test_the_strength_of_reflections_is_an_index_of_refraction():
     """Half of 0.04 head-on, and what a specular workflow says."""
     half = bsdf_of("standard_surface", specular=0.5)
     strong = bsdf_of("UsdPreviewSurface", useSpecularWorkflow=1.0, specularColor=[0.2] * 3, metallic=1.0)
-    for found, expected in ((half, 0.02), (strong, 0.2)):
-        assert ((found["eta"] - 1) / (found["eta"] + 1)) ** 2 == pytest.approx(expected)
+    for lobe, expected in ((half, 0.02), (strong, 0.2)):
+        assert ((lobe["eta"] - 1) / (lobe["eta"] + 1)) ** 2 == pytest.approx(expected)
     assert strong["metallic"] == 0
 
 
 def test_coats_dim_what_lies_below():
     """By what they reflect, by their colour, and in OpenPBR by what they reflect back."""
-    found = look("standard_surface", base_color=[0.5] * 3, coat=1.0, coat_color=[1.0, 0.5, 0.2]).inputs["base_color"]
-    np.testing.assert_allclose(found, 0.5 * 0.96 * np.array([1, 0.5, 0.2]))
-    found = look("open_pbr_surface", base_color=[0.5] * 3, coat_weight=1.0, coat_ior=1.5).inputs["base_color"]
+    dimmed = look("standard_surface", base_color=[0.5] * 3, coat=1.0, coat_color=[1.0, 0.5, 0.2]).inputs["base_color"]
+    np.testing.assert_allclose(dimmed, 0.5 * 0.96 * np.array([1, 0.5, 0.2]))
+    dimmed = look("open_pbr_surface", base_color=[0.5] * 3, coat_weight=1.0, coat_ior=1.5).inputs["base_color"]
     inner = 1 - 0.96 / 1.5**2
-    np.testing.assert_allclose(found, 0.5 * 0.96 * (1 - inner) / (1 - 0.5 * inner))
+    np.testing.assert_allclose(dimmed, 0.5 * 0.96 * (1 - inner) / (1 - 0.5 * inner))
     coated = bsdf_of("standard_surface", coat=1.0, coat_IOR=1.6, coat_roughness=0.2)
     expected = [(0.6 / 2.6) ** 2 / 0.04, 0.06 / 0.099]
     assert [coated["clearcoat"], coated["clearcoat_gloss"]] == pytest.approx(expected)
@@ -335,7 +334,7 @@ def test_every_input_of_every_model_is_taken_or_told():
 
         MODELS[model](given)
         MODELS[model](lambda key, given=given: 1.0 if key == "useSpecularWorkflow" else given(key))
-        declared = {each.getName() for each in library().getNodeDef(f"ND_{model}_surfaceshader").getActiveInputs()}
+        declared = {port.getName() for port in library().getNodeDef(f"ND_{model}_surfaceshader").getActiveInputs()}
         assert read <= declared | {"attenuation_distance"}
         missing = declared - read - set(LEFT_OUT[model]) - silent
         assert missing <= {"alpha_cutoff", "thin_film_thickness"}, (model, missing)

@@ -11,7 +11,7 @@ from mitsuba_subdivision.cage.contents import Attribute, CageContents
 from mitsuba_usd.contents import InstanceContents, MaterialContents, NodeContents, ShapeContents, TextureContents
 from mitsuba_usd.picture_detail import TEXELS_PER_PIXEL, texels_for_pictures
 from mitsuba_usd.stage_warnings import StageWarnings
-from mitsuba_usd.texture_image import halvings, read_texture_image, reduced
+from mitsuba_usd.texture_image import read_texture_image, reduced
 from mitsuba_usd.textures import Textures
 from usd.contents_of_scenes import FOV, WIDTH, scene_of, sensor_at
 
@@ -50,8 +50,8 @@ def pixels_of_unit(distance=DISTANCE):
 @pytest.mark.parametrize("side", [0.1, 2.0])
 @pytest.mark.parametrize("uv_side", [1.0, 4.0])
 def test_texels_follow_from_pixels(side, uv_side):
-    found = needed_for(square(side, uv_side), inputs={"base_color": texture()})
-    assert found == {"a.png": pytest.approx(TEXELS_PER_PIXEL * pixels_of_unit() * side / uv_side, rel=ROUNDED)}
+    needed = needed_for(square(side, uv_side), inputs={"base_color": texture()})
+    assert needed == {"a.png": pytest.approx(TEXELS_PER_PIXEL * pixels_of_unit() * side / uv_side, rel=ROUNDED)}
 
 
 def test_the_corner_at_which_a_face_begins_does_not_matter():
@@ -67,8 +67,8 @@ def test_the_copy_that_is_largest_in_the_picture_decides():
     near = np.eye(4)
     near[2, 3] = -DISTANCE / 2
     copies = {"groups": [[square()]], "instances": [InstanceContents("/i", 0, near)]}
-    found = needed_for(square(), inputs={"base_color": texture()}, **copies)["a.png"]
-    assert found == pytest.approx(TEXELS_PER_PIXEL * pixels_of_unit(DISTANCE / 2), rel=ROUNDED)
+    needed = needed_for(square(), inputs={"base_color": texture()}, **copies)["a.png"]
+    assert needed == pytest.approx(TEXELS_PER_PIXEL * pixels_of_unit(DISTANCE / 2), rel=ROUNDED)
 
 
 def test_where_the_detail_is_unknown_nothing_is_reduced():
@@ -101,9 +101,9 @@ def linear(pixels, is_srgb):
 
 @pytest.mark.parametrize(("needed", "side"), [(np.inf, 64), (65, 64), (33, 64), (32, 32), (17, 32), (1, 1), (0, 1)])
 def test_images_keep_as_many_pixels_as_are_needed(needed, side):
-    found = reduced(np.full((64, 64, 3), 200, dtype=np.uint8), needed, is_srgb=True)
-    assert found.shape == (side, side, 3)
-    assert (found == 200).all()
+    small = reduced(np.full((64, 128, 3), 200, dtype=np.uint8), needed, is_srgb=True)
+    assert small.shape == (side, 2 * side, 3)
+    assert (small == 200).all()
 
 
 def test_a_picture_that_repeats_needs_fewer_texels():
@@ -115,9 +115,9 @@ def test_a_picture_that_repeats_needs_fewer_texels():
 
 @pytest.mark.parametrize(("size", "most", "side"), [((63, 64), 33, 32), ((64, 64), 64, 64), ((5, 3), 1, 1)])
 def test_a_limit_holds_for_all_sizes(size, most, side):
-    found = reduced(np.full((*size, 3), 200, dtype=np.uint8), np.inf, most, is_srgb=True)
-    assert max(found.shape[:2]) == side
-    assert (found == 200).all()
+    small = reduced(np.full((*size, 3), 200, dtype=np.uint8), np.inf, most, is_srgb=True)
+    assert max(small.shape[:2]) == side
+    assert (small == 200).all()
 
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.float16, np.float32])
@@ -125,8 +125,8 @@ def test_a_limit_holds_for_all_sizes(size, most, side):
 def test_images_of_other_types_are_halved_as_bytes_are(dtype, is_srgb):
     pixels = np.random.default_rng(0).integers(0, 256, (16, 8, 4), dtype=np.uint8)
     others = pixels * np.uint16(257) if dtype == np.uint16 else (pixels / 255).astype(dtype)
-    found = reduced(others, 4, is_srgb=is_srgb) / (65535 if dtype == np.uint16 else 1)
-    np.testing.assert_allclose(found, reduced(pixels, 4, is_srgb=is_srgb) / 255, rtol=0, atol=LEVEL)
+    small = reduced(others, 4, is_srgb=is_srgb) / (65535 if dtype == np.uint16 else 1)
+    np.testing.assert_allclose(small, reduced(pixels, 4, is_srgb=is_srgb) / 255, rtol=0, atol=LEVEL)
 
 
 @pytest.mark.parametrize(("channels", "space"), [(1, "auto"), (3, "auto"), (3, "raw")])
@@ -139,10 +139,10 @@ def test_jpeg_files_are_decoded_at_a_scale(tmp_path, channels, space):
     full = read_texture_image(path).pixels
     assert full.shape == (128, 256, channels)
     for needed in (64, 17, 8):
-        found = read_texture_image(path, space, needed).pixels
+        small = read_texture_image(path, space, needed).pixels
         expected = reduced(full, needed, is_srgb=space == "auto" and channels == 3)
-        assert found.shape == expected.shape
-        np.testing.assert_allclose(found.astype(float), expected, rtol=0, atol=JPEG_LEVELS)
+        assert small.shape == expected.shape
+        np.testing.assert_allclose(small.astype(float), expected, rtol=0, atol=JPEG_LEVELS)
 
 
 def test_one_file_is_read_for_each_of_its_uses(tmp_path):
@@ -154,8 +154,8 @@ def test_one_file_is_read_for_each_of_its_uses(tmp_path):
     for order in (uses, uses[::-1]):
         textures = Textures(StageWarnings(), {path: 8.0})
         textures.read(order)
-        for each in uses:
-            np.testing.assert_allclose(textures.mean(each), 0.5, rtol=0, atol=0.01)
+        for use in uses:
+            np.testing.assert_allclose(textures.mean(use), 0.5, rtol=0, atol=0.01)
         assert textures.radiance(path, np.ones(3)).size().x == 64
 
 
@@ -171,8 +171,8 @@ def test_two_components_are_red_and_green(monkeypatch):
     values = np.random.default_rng(1).random((4, 4, 2)).astype(np.float32)
     monkeypatch.setattr("mitsuba_usd.textures.baked", lambda *_: (values, np.eye(3), "repeat"))
     given = NodeContents("texcoord", "vector2", {"name": "st"})
-    found = np.array(Textures(StageWarnings()).color(given)["bitmap"])
-    np.testing.assert_array_equal(found, np.pad(values, ((0, 0), (0, 0), (0, 1))))
+    color = np.array(Textures(StageWarnings()).color(given)["bitmap"])
+    np.testing.assert_array_equal(color, np.pad(values, ((0, 0), (0, 0), (0, 1))))
 
 
 def test_tiles_are_read_smaller_each(tmp_path):
@@ -180,8 +180,3 @@ def test_tiles_are_read_smaller_each(tmp_path):
         mi.Bitmap(np.full((64, 64, 3), number - 1000, np.uint8)).write(str(tmp_path / f"a.{number}.png"))
     for limits, shape in (([20], (32, 64, 3)), ([20, 16], (16, 32, 3))):
         assert read_texture_image(str(tmp_path / "a.<UDIM>.png"), "raw", *limits).pixels.shape == shape
-
-
-def test_halves_are_counted():
-    assert [halvings((2048, 1024), needed) for needed in (513, 512, 1)] == [0, 1, 10]
-    assert [halvings((2048, 1024), np.inf, most) for most in (2048, 2047, 1)] == [0, 1, 11]

@@ -91,8 +91,8 @@ def test_transforms_are_composed(stage):
     cage = msub.ControlCage.from_file(path, prim="/a/b/smooth", time=2)
     alone = mi.load_dict({"type": "subdivision", **cage.as_properties(mi)})
     # Vertices may come in another order, as the faces of a mirrored cage are turned.
-    expected, found = positions(alone), positions(shapes["a_b_smooth"])
-    np.testing.assert_allclose(np.sort(found, axis=0), np.sort(expected, axis=0), atol=2e-6)
+    expected, placed = positions(alone), positions(shapes["a_b_smooth"])
+    np.testing.assert_allclose(np.sort(placed, axis=0), np.sort(expected, axis=0), atol=2e-6)
     c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
     corners = np.array([[x, y, z] for x in (0, 4) for y in (-1, 1) for z in (-0.5, 0.5)])
     corners = corners @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [1, 2, 3]
@@ -236,7 +236,7 @@ def test_values_of_all_prims_are_the_default_or_else_the_first_sample(stage):
     plain, *others = map(contents, ("default", "samples", "both"))
     assert {shape.name for shape in plain.shapes} == {"/cube", "/parts"}
     assert (plain.camera.focal_length, plain.lights[0].size, plain.resolution) == (70, [2], [20, 10])
-    assert all(same(plain, each) for each in others)
+    assert all(same(plain, other) for other in others)
 
 
 def test_a_layer_without_a_rate_of_times_is_read(stage, tmp_path):
@@ -253,7 +253,7 @@ def test_velocities_of_meshes_are_told_between_samples(stage, time):
     samples = "timeSamples = {{ 1: {0}, 2: {0} }}".format(points.partition(" = ")[2])
     path = stage(mesh("cube", f"point3f[] points.{samples}", faces, f"vector3f[] velocities.{samples}"))
     _, messages = told(StageReader(path).at, time)
-    is_told = ["velocities of meshes are ignored; their points are interpolated" in each for each in messages]
+    is_told = ["velocities of meshes are ignored; their points are interpolated" in message for message in messages]
     assert is_told == [True] * (time in (1.5, 3))
 
 
@@ -336,7 +336,7 @@ def test_subsets_share_the_surface_of_the_whole_mesh(stage, monkeypatch, most_fa
     parts = [shapes["cube"], shapes["cube_2"]]
     cage = msub.ControlCage.from_file(path)
     whole = mi.load_dict({"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": 3})
-    rows, of_parts = (np.concatenate([*map(triangles, each)]).reshape(-1, 9) for each in ([whole], parts))
+    rows, of_parts = (np.concatenate([*map(triangles, shapes_of)]).reshape(-1, 9) for shapes_of in ([whole], parts))
     distances, nearest = cKDTree(rows).query(of_parts)
     assert distances.max() <= rounding
     assert len(set(nearest.tolist())) == len(nearest)
@@ -352,7 +352,7 @@ def test_a_mesh_of_several_materials_is_read_once_for_the_primvars_they_need(sta
     shapes = StageReader(stage("".join(paints) + mesh("cube", CUBE, *subsets))).at().shapes
     plain, *painted = shapes
     assert painted[0].cage is painted[1].cage is not plain.cage
-    assert [each.shown_faces.tolist() for each in shapes] == [[2, 3, 4, 5], [0], [1]]
+    assert [shape.shown_faces.tolist() for shape in shapes] == [[2, 3, 4, 5], [0], [1]]
 
 
 def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(scene):
@@ -389,9 +389,9 @@ def test_a_mesh_that_its_scheme_cannot_subdivide_is_shown_as_polygons(scene, par
     loop = mesh("quads", CUBE, 'uniform token subdivisionScheme = "loop"', part)
     entries, (message,) = told(scene, CAMERA + PAINT + loop)
     assert re.search("prim /quads: face 0 has 4 corners.*; the mesh is shown as polygons", message)
-    shapes = [each for name, each in entries.items() if name.startswith("quads")]
-    assert [each.face_count() for each in shapes] == ([8, 4] if part else [12])
-    corners = np.unique(np.concatenate([positions(each) for each in shapes]), axis=0)
+    shapes = [shape for name, shape in entries.items() if name.startswith("quads")]
+    assert [shape.face_count() for shape in shapes] == ([8, 4] if part else [12])
+    corners = np.unique(np.concatenate([positions(shape) for shape in shapes]), axis=0)
     np.testing.assert_array_equal(np.sort(corners.ravel()), [-1] * 12 + [1] * 12)
 
 
@@ -513,12 +513,12 @@ def test_tiles_are_where_their_numbers_say(shown, tmp_path, is_complete, scale, 
     place = transform("place", "float2 inputs:scale = (2, 2)", "float2 inputs:translation = (1, 1)")
     more = f"float4 inputs:scale = ({scale}, {scale}, {scale}, 1)\nfloat4 inputs:fallback = (1, 0, 1, 1)"
     where = "inputs:st.connect = </paint/place.outputs:result>"
-    found = shown(texture("tile.<UDIM>.png", "raw", more, where) + place)
+    picture = shown(texture("tile.<UDIM>.png", "raw", more, where) + place)
     if is_packed:
         path = package(tmp_path / "packed" / "all.usdz", tmp_path / "stage.usda")
-        found = rendered(msub.usd_scene(path, mi, size=(16, 16)), spp=4)
+        picture = rendered(msub.usd_scene(path, mi, size=(16, 16)), spp=4)
     there = [1, 1, 1] if is_complete else np.array([1, 0, 1]) / scale
-    np.testing.assert_allclose(corners_of(found) / scale, [[1, 0, 0], there, [0, 1, 0], [0, 0, 1]], atol=0.01)
+    np.testing.assert_allclose(corners_of(picture) / scale, [[1, 0, 0], there, [0, 1, 0], [0, 0, 1]], atol=0.01)
 
 
 def test_tiles_of_all_kinds_make_one_picture(tmp_path):
@@ -526,13 +526,13 @@ def test_tiles_of_all_kinds_make_one_picture(tmp_path):
     grey = np.array([[0, 1]], np.float16).repeat(4, axis=0)
     mi.Bitmap(grey).write(str(tmp_path / "a_1001.exr"))
     mi.Bitmap(np.full((4, 6, 3), [0.25, 2, -1], np.float32)).write(str(tmp_path / "a_1003.exr"))
-    found = read_texture_image(str(tmp_path / "a_<UDIM>.exr"))
-    assert found.pixels.shape == (4, 18, 3)
-    np.testing.assert_array_equal(found.is_there, np.repeat([[True, False, True]], 6, axis=1).repeat(4, axis=0))
-    np.testing.assert_allclose(found.pixels[:, 12:], np.broadcast_to([0.25, 2, -1], (4, 6, 3)))
-    assert (np.diff(found.pixels[0, :6, 0].astype(float)) >= 0).all()
-    np.testing.assert_allclose(found.pixels[:, [0, 5]], np.broadcast_to([[[0], [1]]], (4, 2, 3)), atol=1e-3)
-    np.testing.assert_allclose(found.to_uv @ [[0, 3], [0, 1], [1, 1]], [[0, 1], [0, 1], [1, 1]], atol=1e-15)
+    image = read_texture_image(str(tmp_path / "a_<UDIM>.exr"))
+    assert image.pixels.shape == (4, 18, 3)
+    np.testing.assert_array_equal(image.is_there, np.repeat([[True, False, True]], 6, axis=1).repeat(4, axis=0))
+    np.testing.assert_allclose(image.pixels[:, 12:], np.broadcast_to([0.25, 2, -1], (4, 6, 3)))
+    assert (np.diff(image.pixels[0, :6, 0].astype(float)) >= 0).all()
+    np.testing.assert_allclose(image.pixels[:, [0, 5]], np.broadcast_to([[[0], [1]]], (4, 2, 3)), atol=1e-3)
+    np.testing.assert_allclose(image.to_uv @ [[0, 3], [0, 1], [1, 1]], [[0, 1], [0, 1], [1, 1]], atol=1e-15)
 
 
 # Red, green, blue and white: of ACEScg, and of XYZ.
@@ -552,9 +552,9 @@ def test_colours_of_files_with_primaries_of_their_own_are_converted(tmp_path, pr
     colors[0, :, 3:] = 0.5
     path = str(tmp_path / "wide.exr")
     OpenEXR.File({"chromaticities": primaries, "type": OpenEXR.scanlineimage}, {channels: colors}).write(path)
-    found = read_texture_image(path).pixels[0]
-    np.testing.assert_allclose(found[:, :3], expected, atol=2e-4)
-    np.testing.assert_array_equal(found[:, 3:], colors[0, :, 3:])
+    colors_of_file = read_texture_image(path).pixels[0]
+    np.testing.assert_allclose(colors_of_file[:, :3], expected, atol=2e-4)
+    np.testing.assert_array_equal(colors_of_file[:, 3:], colors[0, :, 3:])
     # Data are what the file says.
     np.testing.assert_allclose(read_texture_image(path, "raw").pixels, colors, atol=1e-6)
 
@@ -630,7 +630,7 @@ def test_inputs_of_textures_that_are_ignored_are_told_once_by_name(scene, tmp_pa
     assert old in paint
     changed = paint.replace(old, new.replace("...", old), 2 if old in ('"repeat"', "outputs:rgb") else 1)
     entries, messages = told(scene, changed + mesh("square", SQUARE, bound()))
-    assert [message in each for each in messages] == [True]
+    assert [message in warning for warning in messages] == [True]
     assert "square" in entries
 
 
@@ -675,8 +675,8 @@ def test_planes_with_normal_maps_are_as_bright_as_in_cycles(scene, tmp_path, kin
     # The aperture shows the middle of the square.
     view = camera(aperture=1, placed=moved(rotateX=70, translate=(0, 0, 10)))
     text = view + prim("DomeLight", "dome") + material(inputs, nodes) + mesh("square", SQUARE, bound())
-    found = rendered(scene(text, size=(8, 8)), spp=1024)
-    assert found.mean() == pytest.approx(OF_CYCLES[kind, normal], abs=CYCLES_TOLERANCE[kind])
+    picture = rendered(scene(text, size=(8, 8)), spp=1024)
+    assert picture.mean() == pytest.approx(OF_CYCLES[kind, normal], abs=CYCLES_TOLERANCE[kind])
 
 
 def light(kind, *lines, place=(0, 0, 4), scale=1.0, name="lamp", apis=(), **inputs):
@@ -729,7 +729,7 @@ def test_lights_are_as_large_as_usd_says_and_shine_everywhere(stage, schema, is_
     """Where nothing else is said; spheres are points where the stage says so."""
     path = stage(light(schema, f"bool treatAsPoint = {is_point}", apis=["ShapingAPI", "ShadowAPI"]))
     contents, messages = told(StageReader(path).at)
-    assert ([(each.kind, each.size) for each in contents.lights], messages) == ([(kind, size)], [])
+    assert ([(lamp.kind, lamp.size) for lamp in contents.lights], messages) == ([(kind, size)], [])
 
 
 def test_cones_of_spheres_are_spots(scene):
@@ -741,9 +741,9 @@ def test_cones_of_spheres_are_spots(scene):
     angles = np.radians([5, 19, 30, 39.99, 45, 135])
     seen = dr.zeros(mi.SurfaceInteraction3f, len(angles))
     seen.p = mi.Point3f(2 * np.sin(angles), 0 * angles, 4 - 2 * np.cos(angles))
-    found = np.array(lamp.sample_direction(seen, dr.zeros(mi.Point2f, len(angles)))[1])[0]
+    intensity = np.array(lamp.sample_direction(seen, dr.zeros(mi.Point2f, len(angles)))[1])[0]
     # A sphere of radius 1 and radiance 1, seen from a distance of 2.
-    np.testing.assert_allclose(found, np.pi / 4 * np.array([1, 1, 0.5, 0, 0, 0]), atol=2e-3)
+    np.testing.assert_allclose(intensity, np.pi / 4 * np.array([1, 1, 0.5, 0, 0, 0]), atol=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -797,15 +797,15 @@ def test_lights_of_a_studio_are_as_bright_for_a_camera_of_the_stage(scene):
     places = (np.indices((16, 16)).reshape(2, -1) + 0.5) / 16
     middle = dr.zeros(mi.SurfaceInteraction3f)
     for name in ("key_light", "fill_light", "rim_light"):
-        found = []
+        irradiances = []
         for view, kind in (("", "rectangle"), (CAMERA, "directional")):
             entries = scene(view + mesh("cube", CUBE))
             assert entries[name]["type"] == kind
             alone = mi.load_dict({"type": "scene", "light": entries[name]})
             # Mean of what comes from all places of a light: its irradiance.
             weight = alone.sample_emitter_direction(middle, mi.Point2f(places), False)[1]
-            found.append(np.array(weight).reshape(3, -1).mean(axis=1))
-        np.testing.assert_allclose(found[1], found[0], rtol=AREA_LIGHT)
+            irradiances.append(np.array(weight).reshape(3, -1).mean(axis=1))
+        np.testing.assert_allclose(irradiances[1], irradiances[0], rtol=AREA_LIGHT)
 
 
 def test_a_stretched_cylinder_is_as_long_and_as_wide_as_its_axes_say(scene):
@@ -892,7 +892,7 @@ def test_the_aperture_fits_the_picture_as_render_settings_say(scene, projection,
     text = settings(RESOLUTION, f'uniform token aspectRatioConformPolicy = "{policy}"')
     text += camera(f'token projection = "{projection}"', aperture=3) + mesh("cube", CUBE)
     entries, messages = told(scene, text, NAMED)
-    is_told = ['aspectRatioConformPolicy "adjustPixelAspectRatio" is ignored' in each for each in messages]
+    is_told = ['aspectRatioConformPolicy "adjustPixelAspectRatio" is ignored' in message for message in messages]
     assert is_told == [True] * ("Pixel" in policy)
     sensor = mi.load_dict(entries["sensor"])
     assert tuple(sensor.film().size()) == (40, 20)
@@ -908,10 +908,9 @@ def test_render_settings_turn_off_blur(stage, name):
     view = camera("float fStop = 2", "float focusDistance = 7", shutter) + mesh("cube", CUBE)
     blurs = name == "disableDepthOfField"
     for value, is_off in (("false", [False, False]), ("true", [not blurs, blurs])):
-        found = (
-            StageReader(stage(settings(RESOLUTION, f"uniform bool {name} = {value}") + view, head=NAMED)).at().camera
-        )
-        assert [found.shutter == [0, 0], found.lens_radius == 0] == is_off
+        text = settings(RESOLUTION, f"uniform bool {name} = {value}") + view
+        lens = StageReader(stage(text, head=NAMED)).at().camera
+        assert [lens.shutter == [0, 0], lens.lens_radius == 0] == is_off
 
 
 OTHER_SETTINGS = ["float pixelAspectRatio = 2", "float4 dataWindowNDC = (0, 0, 0.5, 1)"]
@@ -939,9 +938,9 @@ def test_what_the_frame_does_not_follow_is_told_once(scene, line, message):
     is_camera = (line, message) in IGNORED_OF_CAMERAS
     text = settings("" if "resolution" in line else RESOLUTION, "" if is_camera else line)
     text += prim("RenderProduct", "product") + camera(line if is_camera else "") + mesh("cube", CUBE)
-    _, (found,) = told(scene, text, NAMED)
-    assert message in found
-    assert found.endswith("(/camera)" if is_camera else "(/settings)")
+    _, (warning,) = told(scene, text, NAMED)
+    assert message in warning
+    assert warning.endswith("(/camera)" if is_camera else "(/settings)")
 
 
 @pytest.mark.parametrize("head", ["", 'renderSettingsPrimPath = "/none"'])
@@ -957,7 +956,7 @@ def test_of_several_cameras_the_first_is_used_and_told(scene, count):
     cameras = "".join(camera(name=name, focal_length=60 if name == "camera_0" else 50) for name in names)
     entries, messages = told(scene, cameras + cube)
     message = f"there are several cameras, and the first is used (/{', /'.join(names)})"
-    assert [message in each for each in messages] == [True] * (count > 1)
+    assert [message in warning for warning in messages] == [True] * (count > 1)
     assert entries["sensor"]["fov"] == scene(camera(focal_length=60) + cube)["sensor"]["fov"]
 
 
@@ -1003,8 +1002,8 @@ def test_normals_of_polygons(scene):
     for hand, authored in (("rightHanded", normals), ("leftHanded", normals), ("rightHanded", indexed)):
         shape = scene(mesh("square", SQUARE, authored, f'uniform token orientation = "{hand}"'))["square"]
         values = np.array(mi.traverse(shape)["vertex_normals"]).reshape(-1, 3).tolist()
-        found = dict(zip(map(tuple, positions(shape)[:, :2].tolist()), values, strict=True))
-        assert (found[(-1, -1)], found[(1, -1)]) == ([1, 0, 0], [0, 1, 0])
+        normals_at = dict(zip(map(tuple, positions(shape)[:, :2].tolist()), values, strict=True))
+        assert (normals_at[(-1, -1)], normals_at[(1, -1)]) == ([1, 0, 0], [0, 1, 0])
 
 
 def test_holes_of_polygons_are_open(scene):
@@ -1080,4 +1079,5 @@ def test_the_scene_of_the_chess_set_finds_the_set_on_the_search_path(tmp_path):
     finally:
         Ar.DefaultResolver.SetDefaultSearchPath([])
     assert "Scene_ChessSet_king" in scene
-    assert {"thinlens", "envmap", "directional"} <= {each["type"] for each in scene.values() if isinstance(each, dict)}
+    kinds = {entry["type"] for entry in scene.values() if isinstance(entry, dict)}
+    assert {"thinlens", "envmap", "directional"} <= kinds
