@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from mitsuba_subdivision.cage import CageContents, CageError, ControlCage
-from mitsuba_subdivision.mesh import IntArray, ragged
+from mitsuba_subdivision.mesh import IntArray, Topology
 from mitsuba_subdivision.schemes import SchemeError
 from mitsuba_subdivision.studio import (
     MOST_SEGMENTS,
@@ -137,11 +137,9 @@ def _pixels_of_texcoords(
     if texcoords is None:
         return np.inf
     corners = np.arange(0, len(cage.face_vertices), 1 + len(cage.face_vertices) // _MOST_SAMPLES)
-    offsets = ragged.offsets(cage.face_sizes)
-    following = np.arange(1, len(cage.face_vertices) + 1)
-    following[offsets[1:] - 1] = offsets[:-1]
-    ends = np.stack([corners, following[corners]])
-    vertices = np.asarray(cage.face_vertices)[ends]
+    topology = Topology(len(cage.positions), cage.face_sizes, cage.face_vertices)
+    ends = np.stack([corners, topology.next[corners]])
+    vertices = topology.face_vertices[ends]
     index = vertices if texcoords.indices is None else np.asarray(texcoords.indices)[ends]
     lengths, in_texture = (
         np.linalg.norm(np.diff(np.asarray(values, dtype=np.float64)[rows], axis=0)[0], axis=1)

@@ -75,10 +75,8 @@ class CachedSurface:
     def _used(self) -> NDArray[np.bool_]:
         """Mask of the vertices of faces that are not holes."""
         cage = self.surface.cage
-        is_shown, used = np.ones(cage.face_count, dtype=bool), np.zeros(cage.vertex_count, dtype=bool)
-        is_shown[cage.holes] = False
-        used[cage.face_vertices[np.repeat(is_shown, cage.face_sizes)]] = True
-        return used
+        is_hole = np.isin(np.arange(cage.face_count), cage.holes)
+        return np.isin(np.arange(cage.vertex_count), cage.face_vertices[np.repeat(~is_hole, cage.face_sizes)])
 
 
 class Surfaces:

@@ -1,6 +1,6 @@
 """Polygon meshes: half-edges, sharpness, cuts and seams, and the one-rings of elements."""
 
 from . import ragged
-from .connectivity import IntArray
+from .connectivity import IntArray, Topology
 
-__all__ = ["IntArray", "ragged"]
+__all__ = ["IntArray", "Topology", "ragged"]
