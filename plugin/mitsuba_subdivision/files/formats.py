@@ -8,13 +8,15 @@ from __future__ import annotations
 import errno
 import importlib
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.contents import CageContents
 from ..cage.errors import CageError, warn
+from ..mesh.connectivity import IntArray
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -101,6 +103,15 @@ def write_triangles(
     """
     write = function_named(FORMATS[require_triangle_format(path)].write_triangles)
     write(path, positions, normals, triangles, texcoords, attributes or {})
+
+
+def faces_by_name(names: Sequence[str], number: IntArray) -> dict[str, IntArray]:
+    """Faces of each name that any face has, by the index ``(n_f,)`` of each one's name; names may be repeated."""
+    index = {name: i for i, name in enumerate(dict.fromkeys(names))}
+    number = np.array([index[name] for name in names])[number]
+    ends = np.cumsum(np.bincount(number, minlength=len(index)))
+    faces = np.split(np.argsort(number, kind="stable"), ends[:-1])
+    return {name: of_name for name, of_name in zip(index, faces, strict=True) if len(of_name)}
 
 
 def warn_of_losses(

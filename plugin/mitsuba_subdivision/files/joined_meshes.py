@@ -25,7 +25,7 @@ _PARTS = {
 
 
 def joined(
-    # One or more, with the same rules by name; their indices are checked. A single mesh is returned as it is.
+    # One or more, with the same rules by name; values and indices are checked. A single mesh is returned as it is.
     meshes: Sequence[CageContents],
     name: str,  # Of the file in messages
 ) -> CageContents:
@@ -97,8 +97,7 @@ def _joined_attribute(given: Sequence[Attribute | None]) -> Attribute | None:
     if parts[0].interpolation != "face_varying":
         return Attribute(values, parts[0].interpolation)
     starts = ragged.starts(np.array([len(part.values) for part in parts])).tolist()
-    indices = [np.arange(len(part.values)) if part.indices is None else part.indices for part in parts]
-    rows = np.concatenate([rows + start for rows, start in zip(indices, starts, strict=True)])
+    rows = np.concatenate([np.asarray(part.indices) + start for part, start in zip(parts, starts, strict=True)])
     return Attribute(values, "face_varying", rows)
 
 

@@ -12,6 +12,7 @@ from ..cage.contents import Attribute, CageContents
 from ..cage.errors import CageError, CageSource, warn
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
+from .formats import faces_by_name
 from .obj_tags import read_tags
 from .obj_text import SPACE, ObjText, parsed, run_starts
 
@@ -110,10 +111,7 @@ def _materials(obj: ObjText, is_face: NDArray[np.bool_]) -> dict[str, IntArray]:
     used = list(re.finditer(rb"^[ \t]*usemtl\b(.*)$", obj.text, re.MULTILINE))
     names = ["", *(use[1].strip().decode(errors="backslashreplace") for use in used)]
     number = np.searchsorted([use.start() for use in used], obj.statement_start[is_face], side="right")
-    distinct = {name: i for i, name in enumerate(dict.fromkeys(names))}
-    number = np.array([distinct[name] for name in names])[number]
-    faces = {name: np.flatnonzero(number == i) for name, i in distinct.items()}
-    return {name: of_name for name, of_name in faces.items() if len(of_name)}
+    return faces_by_name(names, number)
 
 
 def _read_numbers(

@@ -20,7 +20,7 @@ from ..cage.errors import CageError, CageSource, shortened, warn
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..whole_file import whole_file
-from .formats import warn_of_losses
+from .formats import faces_by_name, warn_of_losses
 
 if TYPE_CHECKING:
     from plyfile import PlyData, PlyElement
@@ -159,11 +159,8 @@ def _listed(names: Sequence[str]) -> str:
 
 def _materials(numbers: NDArray) -> dict[str, IntArray]:
     """Faces of each material, by its name."""
-    numbers = np.maximum(np.asarray(numbers).astype(np.int64), -1)
-    distinct, counts = np.unique(numbers, return_counts=True)
-    faces = np.split(np.argsort(numbers, kind="stable"), np.cumsum(counts)[:-1])
-    names = ["" if number < 0 else f"material_{number}" for number in distinct.tolist()]
-    return dict(zip(names, faces, strict=True))
+    distinct, index = np.unique(np.maximum(np.asarray(numbers).astype(np.int64), -1), return_inverse=True)
+    return faces_by_name(["" if number < 0 else f"material_{number}" for number in distinct.tolist()], index.ravel())
 
 
 def _vertex_data(data: NDArray, numbers: Sequence[str]) -> tuple[Attribute | None, dict[str, Attribute]]:
