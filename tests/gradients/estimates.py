@@ -41,7 +41,7 @@ class Pictures:
 
     def __init__(self, scene, start, along, spp, seeds=6):
         self.scene, self.parameters = scene, mi.traverse(scene)
-        self.start, self.along = ({k: upload(mi.Float, v) for k, v in each.items()} for each in (start, along))
+        self.start, self.along = ({k: upload(mi.Float, v) for k, v in named.items()} for named in (start, along))
         self.spp, self.seeds = spp, range(seeds)
 
     def mean(self, step, seed):
@@ -56,18 +56,18 @@ class Pictures:
         return Estimate(np.array([(a - b) / (2 * h) for a, b in ends]))
 
     def derivatives(self, mode):
-        found = []
+        values = []
         for seed in self.seeds:
             step = mi.Float(0)
             dr.enable_grad(step)
             value = self.mean(step, seed)
             if mode == "forward":
                 dr.forward(step)
-                found.append(dr.grad(value).array[0])
+                values.append(dr.grad(value).array[0])
             else:
                 dr.backward(value)
-                found.append(dr.grad(step)[0])
-        return Estimate(np.array(found, dtype=np.float64))
+                values.append(dr.grad(step)[0])
+        return Estimate(np.array(values, dtype=np.float64))
 
 
 def gradients(scene, key, spp, seeds=6, kept=()):
@@ -76,7 +76,7 @@ def gradients(scene, key, spp, seeds=6, kept=()):
     Parameters that are ``kept`` are assigned as well: Mitsuba's own meshes make new normals when only positions are.
     """
     parameters = mi.traverse(scene)
-    start, found = mi.Float(parameters[key]), []
+    start, by_seed = mi.Float(parameters[key]), []
     # Copies: what is the same array is no assignment.
     others = {name: dr.opaque(parameters[name]) for name in kept}
     for seed in range(seeds):
@@ -87,12 +87,12 @@ def gradients(scene, key, spp, seeds=6, kept=()):
             parameters[name] = dr.opaque(values)
         parameters.update()
         dr.backward(dr.mean(mi.render(scene, parameters, spp=spp, seed=seed), axis=None))
-        found.append(np.array(dr.grad(points), dtype=np.float64).reshape(-1, 3))
+        by_seed.append(np.array(dr.grad(points), dtype=np.float64).reshape(-1, 3))
     parameters[key] = start
     parameters.update()
-    return np.array(found)
+    return np.array(by_seed)
 
 
-def along(found, direction):
+def along(by_seed, direction):
     """Estimate of the derivative along a direction."""
-    return Estimate((found * direction).sum(axis=(1, 2)))
+    return Estimate((by_seed * direction).sum(axis=(1, 2)))

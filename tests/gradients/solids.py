@@ -31,9 +31,9 @@ def of_triangles(types, positions, triangles):
     return {"area": [area], "volume": [dr.sum(volume)], "first": first, "second": second}
 
 
-def joined(found):
+def joined(integrals):
     """All integrals one after the other."""
-    return np.concatenate([np.ravel([np.array(each) for each in found[name]]) for name in found])
+    return np.concatenate([np.ravel([np.array(value) for value in integrals[name]]) for name in integrals])
 
 
 def derivatives_of(surface, directions, rate, types):
@@ -45,10 +45,10 @@ def derivatives_of(surface, directions, rate, types):
         points = types.floats(surface.cage.positions.ravel())
         dr.enable_grad(points)
         dr.set_grad(points, types.floats(direction.ravel()))
-        found = of_triangles(types, kernel(points)[0], table.triangles)
-        dr.forward_to(found)
-        derivatives.append(joined(dr.grad(found)))
-    return joined(dr.detach(found)), np.array(derivatives)
+        integrals = of_triangles(types, kernel(points)[0], table.triangles)
+        dr.forward_to(integrals)
+        derivatives.append(joined(dr.grad(integrals)))
+    return joined(dr.detach(integrals)), np.array(derivatives)
 
 
 def of_surface(surface):
@@ -61,13 +61,13 @@ def of_surface(surface):
 def derivatives_of_surface(surface, directions):
     """``(n, 10)`` derivatives of volume and moments by moving the control points along each of ``n`` directions."""
     each_field = [field[surface.cage.cut_mesh.vertex] for field in (surface.cage.positions, *directions)]
-    own, *moves = (SurfacePieces.build(surface.patches, field) for field in each_field)
-    total = _integrated(own.regular, [each.regular for each in moves])
-    for tips, *moved in zip(own.tips, *(each.tips for each in moves), strict=True):
+    points, *moves = (SurfacePieces.build(surface.patches, field) for field in each_field)
+    total = _integrated(points.regular, [field_pieces.regular for field_pieces in moves])
+    for tips, *moved in zip(points.tips, *(field_pieces.tips for field_pieces in moves), strict=True):
         for level in range(MOST_LEVELS):
-            found = _integrated(tips.level(level), [each.level(level) for each in moved])
-            total += found
-            if (np.abs(found).max(axis=1) <= LEFT_OUT * np.abs(total).max(axis=1)).all():
+            of_level = _integrated(tips.level(level), [field_pieces.level(level) for field_pieces in moved])
+            total += of_level
+            if (np.abs(of_level).max(axis=1) <= LEFT_OUT * np.abs(total).max(axis=1)).all():
                 break
     return total
 
@@ -76,10 +76,10 @@ def _integrated(pieces, moves):
     """``(n, 10)`` integrals of 1, x, y, z and products of these, times each field's part along the normal."""
     uv, weights = pieces.basis.domain.quadrature(ORDER)
     at = pieces.basis.values(uv)
-    by_u, by_v = (at @ each for each in pieces.basis.derivatives)
+    by_u, by_v = (at @ part for part in pieces.basis.derivatives)
     p = pieces.origins[:, None] + at @ pieces.coefficients
     normal = np.cross(by_u @ pieces.coefficients, by_v @ pieces.coefficients)
-    fields = (each.origins[:, None] + at @ each.coefficients for each in moves)
+    fields = (part.origins[:, None] + at @ part.coefficients for part in moves)
     flows = [((field * normal).sum(axis=2) * weights).ravel() for field in fields]
     functions = [np.ones(p.shape[:2]), *np.moveaxis(p, 2, 0), *(p[..., i] * p[..., j] for i, j in PAIRS)]
-    return np.array(flows) @ np.array([each.ravel() for each in functions]).T
+    return np.array(flows) @ np.array([part.ravel() for part in functions]).T

@@ -75,20 +75,20 @@ def wrong_parts(scheme, by):
         parameters.update()
         si = scene.ray_intersect(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV, True)
         # Dr.Jit clears the derivatives of what others are computed from.
-        found = {name: dr.ravel(1 * attrgetter(name)(si)) for name in FIELDS}
-        dr.eval(found)
-        return found
+        derivatives = {name: dr.ravel(1 * attrgetter(name)(si)) for name in FIELDS}
+        dr.eval(derivatives)
+        return derivatives
 
     ahead, behind = (fields(dr.opaque(mi.Float, sign * STEP)) for sign in (1, -1))
     step = mi.Float(0)
     dr.enable_grad(step)
-    found = fields(step)
+    derivatives = fields(step)
     dr.set_grad(step, 1)
-    dr.forward_to(*found.values())
+    dr.forward_to(*derivatives.values())
     wrong = {}
     for name in FIELDS:
         differences = (ahead[name].numpy() - behind[name].numpy()) / (2 * STEP)
-        error = np.abs(dr.grad(found[name]).numpy() - differences).reshape(RAYS, -1).max(axis=1)
+        error = np.abs(dr.grad(derivatives[name]).numpy() - differences).reshape(RAYS, -1).max(axis=1)
         size = np.abs(differences).reshape(RAYS, -1).max(axis=1)
         unit = np.median(size) or 1.0
         wrong[name] = np.mean(error > (DISPLACED if is_displaced else DIFFERENCE) * (unit + size))

@@ -62,10 +62,10 @@ AFFINE = {
 
 
 def test_affine_motions_change_volume_and_moments_as_they_must(surface):
-    own = solids.of_surface(surface)
-    found = solids.derivatives_of_surface(surface, [surface.cage.positions @ a.T + b for a, b in AFFINE.values()])
-    expected = [expected_of(linear, shift, *own.values()) for linear, shift in AFFINE.values()]
-    assert np.abs(found - expected).max() <= ROUNDING * np.abs(solids.joined(own)).max()
+    integrals = solids.of_surface(surface)
+    derivatives = solids.derivatives_of_surface(surface, [surface.cage.positions @ a.T + b for a, b in AFFINE.values()])
+    expected = [expected_of(linear, shift, *integrals.values()) for linear, shift in AFFINE.values()]
+    assert np.abs(derivatives - expected).max() <= ROUNDING * np.abs(solids.joined(integrals)).max()
 
 
 def test_scaling_turning_and_shifting_change_the_area_as_they_must(surface):
@@ -78,13 +78,13 @@ def test_scaling_turning_and_shifting_change_the_area_as_they_must(surface):
 
 def test_hadamards_formula_is_the_derivative_of_volume_and_moments(surface):
     positions, direction = surface.cage.positions, motions(surface)["all"]
-    (found,) = solids.derivatives_of_surface(surface, [direction])
+    (derivatives,) = solids.derivatives_of_surface(surface, [direction])
 
     def integrals(step):
         return solids.joined(solids.of_surface(moved(surface, positions + step * direction)))
 
     expected = WEIGHTS @ [integrals(step) - integrals(-step) for step in STEPS] / STEPS[0]
-    assert np.abs(found - expected).max() <= POLYNOMIAL * np.abs(expected).max()
+    assert np.abs(derivatives - expected).max() <= POLYNOMIAL * np.abs(expected).max()
 
 
 # Of triangles
@@ -94,15 +94,15 @@ def test_gradients_of_triangles_converge_to_those_of_the_surface(surface, types)
     linear, shift = AFFINE["shear"]
     directions = [*motions(surface).values(), surface.cage.positions @ linear.T + shift]
     area = surface.stiffness(solids.STIFFNESS_ORDER) @ surface.cage.positions
-    areas = [(area * each).sum() for each in directions]
+    areas = [(area * direction).sum() for direction in directions]
     exact = np.column_stack([areas, solids.derivatives_of_surface(surface, directions)])
     errors = []
     for rate in RATES:
-        values, found = solids.derivatives_of(surface, directions, rate, types)
-        errors.append(np.linalg.norm(found - exact, axis=0) / np.linalg.norm(exact, axis=0))
+        values, derivatives = solids.derivatives_of(surface, directions, rate, types)
+        errors.append(np.linalg.norm(derivatives - exact, axis=0) / np.linalg.norm(exact, axis=0))
         # The triangles' own volume and moments obey the closed forms exactly.
         forms = expected_of(linear, shift, values[1:2], values[2:5], values[5:])
-        assert np.abs(found[-1, 1:] - forms).max() <= ROUNDING * np.abs(values[1:]).max()
+        assert np.abs(derivatives[-1, 1:] - forms).max() <= ROUNDING * np.abs(values[1:]).max()
     ratios = np.divide(errors[1:], errors[:-1])
     assert max(errors[-1]) <= FINEST
     assert ratios.min() >= QUARTER[0]
@@ -142,7 +142,7 @@ def test_area_of_a_flat_sheet_changes_at_its_border_only(triangles, types, np_rn
     dr.enable_grad(points)
     vertices, _ = VertexKernel(table, types.float)(points)
     dr.backward(solids.of_triangles(types, vertices, table.triangles)["area"][0])
-    found = np.array(dr.grad(points)).reshape(-1, 3)
-    for gradient, tolerance in ((exact, AREA), (found, ROUNDING)):
+    of_triangles = np.array(dr.grad(points)).reshape(-1, 3)
+    for gradient, tolerance in ((exact, AREA), (of_triangles, ROUNDING)):
         for field, expected in fields:
             assert abs((gradient * field).sum() - expected) <= 12 * tolerance

@@ -23,17 +23,17 @@ SUMS = 1e-5
 @pytest.mark.parametrize("name", SURFACES)
 def test_gradients_of_outlines_are_those_of_the_area_covered(name):
     surface = SURFACES[name]()
-    found = gradients(outline(properties(surface)), POINTS, SAMPLES)
+    by_points = gradients(outline(properties(surface)), POINTS, SAMPLES)
     # No outline changes by more than its own size.
     largest = np.abs(surface.cage.positions).max()
     ways = {key: way * largest / np.abs(way).max() for key, way in motions(surface).items()}
     size = abs(change(surface, ways["scaling"]))
     for key, way in ways.items():
         # A black shape takes away from the sky.
-        expected, estimate = -change(surface, way), along(found, way)
+        expected, estimate = -change(surface, way), along(by_points, way)
         assert estimate.error <= MEANS_SOMETHING * size, key
         assert abs(estimate.mean - expected) <= ERRORS * estimate.error + LINES * size, key
-    assert along(found, ways["scaling"]).error <= MEANS_SOMETHING / 3 * size
+    assert along(by_points, ways["scaling"]).error <= MEANS_SOMETHING / 3 * size
 
 
 def test_forward_derivatives_of_outlines_are_the_same():
@@ -48,15 +48,15 @@ def test_placing_moves_outlines_as_control_points_do():
     surface = SURFACES["concave, loop"]()
     scene = outline(properties(surface))
     by_points = along(gradients(scene, POINTS, SAMPLES, 2), surface.cage.positions)
-    parameters, found = mi.traverse(scene), []
+    parameters, by_size = mi.traverse(scene), []
     for seed in range(2):
         size = mi.Float(1)
         dr.enable_grad(size)
         parameters["shape.to_world"] = mi.AffineTransform4f().scale(size)
         parameters.update()
         dr.backward(dr.mean(mi.render(scene, parameters, spp=SAMPLES, seed=seed), axis=None))
-        found.append(dr.grad(size)[0])
-    np.testing.assert_allclose(found, by_points.values, rtol=1e-4)
+        by_size.append(dr.grad(size)[0])
+    np.testing.assert_allclose(by_size, by_points.values, rtol=1e-4)
 
 
 def test_outlines_are_the_same_when_the_same_faces_are_set_again():
@@ -78,13 +78,13 @@ def test_emitters_with_interpolated_normals_have_the_bias_that_the_triangles_hav
     made.save(tmp_path / "same.ply")
     ply = {"type": "ply", "filename": str(tmp_path / "same.ply")}
     expected = change(surface, surface.cage.positions)
-    own = along(gradients(outline(properties(surface), emits=True), POINTS, SAMPLES), surface.cage.positions)
+    ours = along(gradients(outline(properties(surface), emits=True), POINTS, SAMPLES), surface.cage.positions)
     kept = ["shape.vertex_normals"]
     theirs = gradients(outline(ply, emits=True), "shape.vertex_positions", SAMPLES, kept=kept)
-    assert own.error <= MEANS_SOMETHING / 3 * expected
+    assert ours.error <= MEANS_SOMETHING / 3 * expected
     # The same samples of the same triangles, whose vertices the file has in single precision.
-    assert abs((own - along(theirs, made.positions)).mean) <= own.error
-    assert own.mean - expected > 2 * ERRORS * own.error
+    assert abs((ours - along(theirs, made.positions)).mean) <= ours.error
+    assert ours.mean - expected > 2 * ERRORS * ours.error
     flat = outline(properties(surface, face_normals=True), emits=True)
     flat = along(gradients(flat, POINTS, SAMPLES), surface.cage.positions)
     assert abs(flat.mean - expected) <= ERRORS * flat.error + LINES * expected

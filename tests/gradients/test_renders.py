@@ -41,12 +41,12 @@ def test_derivatives_inside_an_outline_are_differences(material, shading, modes)
     In the latter case, light from below these planes is shadowed: see the next test.
     """
     pictures = moving(material, shading, "around" if shading == "exact" else "before")
-    found = [pictures.derivatives(mode) for mode in modes]
+    derivatives = [pictures.derivatives(mode) for mode in modes]
     difference = pictures.differences(STEP)
-    apart = found[-1] - difference
-    assert max(found[-1].error, difference.error) <= MEANS_SOMETHING * abs(found[-1].mean)
+    apart = derivatives[-1] - difference
+    assert max(derivatives[-1].error, difference.error) <= MEANS_SOMETHING * abs(derivatives[-1].mean)
     assert abs(apart.mean) <= ERRORS * apart.error + BENT * abs(difference.mean)
-    np.testing.assert_allclose(found[0].values, found[-1].values, rtol=SINGLE)
+    np.testing.assert_allclose(derivatives[0].values, derivatives[-1].values, rtol=SINGLE)
 
 
 def test_interpolated_normals_have_the_gradients_that_the_triangles_have_as_a_ply(tmp_path):
@@ -64,8 +64,8 @@ def test_interpolated_normals_have_the_gradients_that_the_triangles_have_as_a_pl
     changes = {name: (ahead[name] - behind[name]) / (2 * STEP) for name in start}
     ply = inside("diffuse", "around", {"type": "ply", "filename": str(tmp_path / "same.ply")})
     theirs = Pictures(ply, start, changes, SAMPLES_OF_SHADOWS)
-    own, other = (each.derivatives("reverse") for each in (ours, theirs))
+    gradient, other = (pictures.derivatives("reverse") for pictures in (ours, theirs))
     # The same samples of the same triangles.
-    np.testing.assert_allclose(own.values, other.values, rtol=0, atol=SINGLE * abs(own.mean) * 10)
-    apart = own - ours.differences(STEP)
+    np.testing.assert_allclose(gradient.values, other.values, rtol=0, atol=SINGLE * abs(gradient.mean) * 10)
+    apart = gradient - ours.differences(STEP)
     assert abs(apart.mean) > ERRORS * apart.error

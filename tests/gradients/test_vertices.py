@@ -72,16 +72,16 @@ def test_forward_reverse_and_differences_agree(name, tessellation, mirror, np_rn
     points, matrix = given()
     dr.set_grad(points, arrays.Float64(move.ravel()))
     dr.set_grad(matrix, arrays.Matrix4f64(turn))
-    dr.forward_to(*(found := vertices(points, matrix)))
-    forward = [np.array(dr.grad(each)).reshape(-1, 3) for each in found]
+    dr.forward_to(*(moving := vertices(points, matrix)))
+    forward = [np.array(dr.grad(array)).reshape(-1, 3) for array in moving]
     for derivative, difference in zip(forward, expected, strict=True):
         assert np.abs(derivative - difference).max() <= DIFFERENCES * np.abs(difference).max()
 
-    weights = [np_rng.normal(size=each.shape) for each in expected]
+    weights = [np_rng.normal(size=array.shape) for array in expected]
     points, matrix = given()
     pairs = zip(vertices(points, matrix), weights, strict=True)
     dr.backward(sum(dr.sum(value * arrays.Float64(weight.ravel())) for value, weight in pairs))
-    by_points, by_matrix = (np.array(dr.grad(each)) for each in (points, matrix))
+    by_points, by_matrix = (np.array(dr.grad(array)) for array in (points, matrix))
     reverse = by_points @ move.ravel() + (by_matrix.reshape(4, 4) * turn).sum()
     products = np.concatenate([(a * b).ravel() for a, b in zip(forward, weights, strict=True)])
     assert abs(reverse - products.sum()) <= ROUNDING * np.abs(products).sum()
@@ -90,6 +90,6 @@ def test_forward_reverse_and_differences_agree(name, tessellation, mirror, np_rn
 def test_adaptive_rates_differ():
     """Else the tests above would prove nothing about strips between unlike rates."""
     surface = ALL["catmull_clark"]()
-    uniform, chosen = (table_of(surface, each) for each in ("uniform", "adaptive"))
+    uniform, chosen = (table_of(surface, kind) for kind in ("uniform", "adaptive"))
     counts = np.bincount(chosen.element) / np.bincount(uniform.element)
     assert counts.max() > 1.5 * counts.min()

@@ -93,9 +93,9 @@ def test_an_orthographic_sensor_sees_the_outline_that_one_from_far_away_sees():
         to_world = looking_at_the_middle(distance * np.array([4.0, -6, 3]))
         return make(chord_error=1e-2, sensor_to_world=to_world, sensor_fov=fov, **FILM, outline="sensor")
 
-    found = seen(0.0, 1)
-    assert_same_triangles(found, seen(1e-3, 1e5))
-    assert found.face_count() < make(chord_error=1e-2).face_count()
+    orthographic = seen(0.0, 1)
+    assert_same_triangles(orthographic, seen(1e-3, 1e5))
+    assert orthographic.face_count() < make(chord_error=1e-2).face_count()
 
 
 @llvm

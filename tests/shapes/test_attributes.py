@@ -28,8 +28,8 @@ def test_properties_give_the_same_cage_to_every_evaluator_and_flat_faces(np_rng)
         assert shape.vertex_count() == len(expected)
         np.testing.assert_allclose(buffer(shape, "vertex_texcoords"), expected, atol=SINGLE)
 
-    for each in (ISLANDS, *(Attribute(np_rng.random((8, 2)), kind) for kind in ("vertex", "varying"))):
-        assert_textured(cube(texcoords=each, face_varying="none"))
+    for texcoords in (ISLANDS, *(Attribute(np_rng.random((8, 2)), kind) for kind in ("vertex", "varying"))):
+        assert_textured(cube(texcoords=texcoords, face_varying="none"))
     assert_textured(with_attributes(), evaluator="stam", sample_offset=1e-3)
     assert_textured(with_attributes(), face_normals=True)
 
@@ -53,18 +53,18 @@ def test_rendering_takes_the_same_kernels_wherever_arrays_lie():
     cage = with_attributes()
     # Shapes that still live are part of kernels, too.
     gc.collect()
-    found, kept = set(), []
+    kernels, kept = set(), []
     for count in range(12):
         kept.append(np.empty(40 * count, dtype=np.uint8))
         shape = make(cage)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
             dr.eval(hit(shape).uv)
-            found.add(tuple(entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT))
+            kernels.add(tuple(entry["hash"] for entry in dr.kernel_history() if entry["type"] == dr.KernelType.JIT))
         # The next shape takes other memory, and this one's place among shapes.
         kept.append(np.array(mi.traverse(shape)["vertex_texcoords"]))
         del shape
-    assert len(found) == 1
+    assert len(kernels) == 1
 
 
 @every_variant
@@ -149,10 +149,10 @@ def square_shape(square, shading):
 @shadings
 @pytest.mark.usefixtures("variants_all")
 def test_attributes_of_a_file_are_those_of_mitsubas_own_shape(square, shading):
-    ours, own = square_shape(square, shading), mi.load_dict({"type": "ply", "filename": square})
+    ours, theirs = square_shape(square, shading), mi.load_dict({"type": "ply", "filename": square})
     wavelengths = [450, 500, 550, 600] if mi.is_spectral else []
-    found = []
-    for shape in (ours, own):
+    by_shape = []
+    for shape in (ours, theirs):
         scene = scene_with(shape=shape)
         si = scene.ray_intersect(mi.Ray3f([0.3, 0.1, 5], [0, 0, -1], 0, wavelengths))
         values = {}
@@ -163,14 +163,14 @@ def test_attributes_of_a_file_are_those_of_mitsubas_own_shape(square, shading):
             # In spectral variants, Mitsuba takes other attributes of three numbers for spectra, too.
             if "color" in name or len(columns) == 1 or not mi.is_spectral:
                 values[f"spectrum of {name}"] = np.array(shape.eval_attribute(f"vertex_{name}", si)).ravel()
-        found.append(values)
-    for name, expected in found[1].items():
-        np.testing.assert_allclose(found[0][name], expected, rtol=SPECTRUM, atol=SPECTRUM, err_msg=name)
+        by_shape.append(values)
+    for name, expected in by_shape[1].items():
+        np.testing.assert_allclose(by_shape[0][name], expected, rtol=SPECTRUM, atol=SPECTRUM, err_msg=name)
     # Of 0.2, 0.5, 0.1: green.
-    assert mi.is_monochromatic or found[0]["spectrum of color"][[1, 2]].max() > 0.45
+    assert mi.is_monochromatic or by_shape[0]["spectrum of color"][[1, 2]].max() > 0.45
     if not mi.is_spectral:
         # The values of the file.
-        np.testing.assert_allclose(found[0]["color"], [0.2, 0.5, 0.1], atol=SPECTRUM)
+        np.testing.assert_allclose(by_shape[0]["color"], [0.2, 0.5, 0.1], atol=SPECTRUM)
     given = np.array(mi.traverse(ours)["cage_color"])
     np.testing.assert_allclose(given, np.tile([0.2, 0.5, 0.1], 4), atol=SPECTRUM)
 
@@ -211,8 +211,8 @@ def test_meshes_of_polygons_have_spectra_as_well(name, count):
         expected = mi.load_dict({"type": "srgb", "color": expected}).eval(si)
     elif mi.is_monochromatic:
         expected = mi.luminance(mi.Color3f(expected))
-    found = np.array(mesh.eval_attribute(name, si)).ravel()
-    np.testing.assert_allclose(found, np.array(expected).ravel(), atol=SPECTRUM)
+    value = np.array(mesh.eval_attribute(name, si)).ravel()
+    np.testing.assert_allclose(value, np.array(expected).ravel(), atol=SPECTRUM)
 
 
 @exact
@@ -229,8 +229,8 @@ def test_frozen_functions_look_up_spectra(square):
     frozen = dr.freeze(spectrum)
     for grey in (0.25, 0.75, 0.5):
         update(parameters, {"shape.cage_color": dr.full(mi.Float, grey, 12)})
-        found = frozen(scene, mi.Float(-0.1 * grey, 0.1, 0.2))
-        np.testing.assert_allclose(np.array(found), grey, atol=SPECTRUM)
+        looked_up = frozen(scene, mi.Float(-0.1 * grey, 0.1, 0.2))
+        np.testing.assert_allclose(np.array(looked_up), grey, atol=SPECTRUM)
     # The last values were looked up without Python.
     assert frozen.n_recordings < 3
 
@@ -252,7 +252,7 @@ def test_textured_emitters_light_as_with_vertex_shading(kind, displacement):
         scene = scene_with(integrator={"type": "path"}, shape=shape, **seen)
         si = scene.ray_intersect(down(1.9, 0.3, 4))
         drawn = (scene.sample_emitter_direction(si, mi.Point2f(*xy), False)[0] for xy in ([0.2, 0.7], [0.9, 0.4]))
-        points.append([np.array(each.p).ravel() for each in drawn])
+        points.append([np.array(sample.p).ravel() for sample in drawn])
         means.append(np.array(mi.render(scene, spp=256)).mean())
     np.testing.assert_allclose(points[0], points[1], rtol=0, atol=DRAWN)
     assert means[0] == pytest.approx(means[1], rel=0.01)

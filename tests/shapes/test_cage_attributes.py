@@ -99,10 +99,10 @@ def test_a_frozen_function_sees_new_values(shading, interpolation, by):
 
     frozen, before = dr.freeze(seen), None
     for _ in range(3):
-        found = np.array(frozen(scene, x))
-        np.testing.assert_array_equal(found, np.array(seen(scene, x)))
-        assert before is None or not np.array_equal(found, before)
-        before = found
+        now = np.array(frozen(scene, x))
+        np.testing.assert_array_equal(now, np.array(seen(scene, x)))
+        assert before is None or not np.array_equal(now, before)
+        before = now
         update(parameters, {f"cage_{by}": parameters[f"cage_{by}"] * 0.7})
 
 
@@ -128,12 +128,12 @@ def hits(shape):
     """What is asked of the surface at some hits: texture coordinates, their directions, attributes."""
     si = scene_with(shape=shape).ray_intersect(down([0.05, 0.31, -0.17], [0.11, -0.2, 0.27]))
     attributes = *shape.eval_attribute_3("vertex_colour", si), shape.eval_attribute_1("vertex_weight", si)
-    found = [si.uv.x, si.uv.y, *si.dp_du, *si.dp_dv, *attributes, shape.eval_attribute_1("vertex_label", si)]
+    values = [si.uv.x, si.uv.y, *si.dp_du, *si.dp_dv, *attributes, shape.eval_attribute_1("vertex_label", si)]
     valid = si.is_valid()
     # In one kernel.
-    dr.eval(valid, found)
+    dr.eval(valid, values)
     assert dr.all(valid)
-    return np.array([np.array(each) for each in found])
+    return np.array([np.array(value) for value in values])
 
 
 # Vertices of the other cages follow in the test above by updates; hits compile kernels for seconds.
@@ -169,17 +169,17 @@ def test_values_stay_when_triangles_are_chosen_anew(shading):
 def test_what_users_assign_to_vertices_stays_until_the_cage_is_updated_for_which_alone_weights_are_made(monkeypatch):
     shape = make(creased())
     parameters = mi.traverse(shape)
-    own = upload(type(parameters["vertex_colour"]), 0.5 * np.array(parameters["vertex_colour"]))
-    update(parameters, vertex_colour=own, cage_weight=parameters["cage_weight"] * 2)
+    assigned = upload(type(parameters["vertex_colour"]), 0.5 * np.array(parameters["vertex_colour"]))
+    update(parameters, vertex_colour=assigned, cage_weight=parameters["cage_weight"] * 2)
     with monkeypatch.context() as patched:
         patched.setattr(Channel, "weights", None)
         update(parameters, control_points=parameters["control_points"] * 2)
         update(make(creased()), control_points=parameters["control_points"])
-    np.testing.assert_array_equal(np.array(mi.traverse(shape)["vertex_colour"]), np.array(own))
+    np.testing.assert_array_equal(np.array(mi.traverse(shape)["vertex_colour"]), np.array(assigned))
     parameters["cage_colour"] = parameters["cage_colour"] * 1
     parameters.set_dirty("cage_colour")
     parameters.update()
-    np.testing.assert_allclose(np.array(mi.traverse(shape)["vertex_colour"]), 2 * np.array(own), atol=SINGLE)
+    np.testing.assert_allclose(np.array(mi.traverse(shape)["vertex_colour"]), 2 * np.array(assigned), atol=SINGLE)
 
 
 # Gradients
@@ -208,10 +208,10 @@ def test_gradients_of_sums_over_vertices_are_column_sums_of_weights(cage, np_rng
         expected[name] = weights.T @ factors
     dr.backward(loss)
     # In one kernel.
-    found = {name: dr.grad(parameters[f"cage_{name}"]) for name in NAMES}
-    dr.eval(found)
+    gradients = {name: dr.grad(parameters[f"cage_{name}"]) for name in NAMES}
+    dr.eval(gradients)
     for name, values in expected.items():
-        shaped = np.array(found[name]).reshape(values.shape)
+        shaped = np.array(gradients[name]).reshape(values.shape)
         np.testing.assert_allclose(shaped, values, rtol=0, atol=SUM * values.max(), err_msg=name)
 
 
@@ -245,7 +245,7 @@ RENDERS = [
 @every_ad_variant
 @pytest.mark.parametrize(
     ("cage", "shading", "name"),
-    [pytest.param(*each, marks=[exact] if each[1] == "exact" else []) for each in RENDERS],
+    [pytest.param(*case, marks=[exact] if case[1] == "exact" else []) for case in RENDERS],
     indirect=["cage"],
 )
 def test_gradients_of_renders_are_central_differences(cage, name, shading, np_rng):
@@ -297,7 +297,7 @@ def test_each_view_has_its_gradients_after_one_update(name, shading):
 def test_control_points_and_colours_have_gradients_together():
     scene = picture_of(creased(), "colour")
     parameters, keys = mi.traverse(scene), ["shape.control_points", "shape.cage_colour"]
-    found = []
+    gradients = []
     for chosen in ([keys[0]], [keys[1]], keys):
         for key in keys:
             values = mi.Float(dr.detach(parameters[key]))
@@ -308,8 +308,8 @@ def test_control_points_and_colours_have_gradients_together():
         # Twice, so that both are renewed.
         for _ in range(2):
             dr.backward(loss_of(mi.render(scene, parameters, spp=4)))
-        found.append([np.array(dr.grad(parameters[key])) for key in chosen])
-    for alone, together in zip(found[0] + found[1], found[2], strict=True):
+        gradients.append([np.array(dr.grad(parameters[key])) for key in chosen])
+    for alone, together in zip(gradients[0] + gradients[1], gradients[2], strict=True):
         assert np.abs(alone).max() > 0
         np.testing.assert_allclose(together, alone, rtol=0, atol=10 * SUM * np.abs(alone).max())
 
@@ -343,25 +343,25 @@ def test_gradients_of_attributes_follow_the_hit(shading, scheme, by, np_rng):
             moved = mi.AffineTransform4f().translate([0.3 * step, step, -0.5 * step]) @ given
         update(parameters, {by: moved})
         si = scene.ray_intersect(ray)
-        found, is_valid = si.shape.eval_attribute_1("vertex_weight", si), si.is_valid()
-        dr.eval(found, is_valid, si.prim_index)
-        return found, is_valid, si.prim_index
+        weight, is_valid = si.shape.eval_attribute_1("vertex_weight", si), si.is_valid()
+        dr.eval(weight, is_valid, si.prim_index)
+        return weight, is_valid, si.prim_index
 
     ahead, behind = (values(mi.Float(sign * MOVED)) for sign in (1, -1))
     differences = (np.array(ahead[0]) - np.array(behind[0])) / (2 * MOVED)
     step = mi.Float(0)
     dr.enable_grad(step)
-    found, is_valid, triangle = values(step)
+    weight, is_valid, triangle = values(step)
     # Values of vertex shading have kinks between triangles.
-    same = np.all([np.array(each[2]) == np.array(triangle) for each in (ahead, behind)], axis=0) & np.array(is_valid)
+    same = np.all([np.array(end[2]) == np.array(triangle) for end in (ahead, behind)], axis=0) & np.array(is_valid)
     assert same.mean() > 0.5
     differences = differences[same]
     tolerance = MOVED_DIFFERENCE * np.abs(differences).max()
     # The mean over the same rays as the differences.
     signs = np.where(same, np_rng.choice([-1, 1], 64), 0)
-    dr.backward(dr.sum(found * upload(mi.Float, signs)), flags=dr.ADFlag.ClearNone)
+    dr.backward(dr.sum(weight * upload(mi.Float, signs)), flags=dr.ADFlag.ClearNone)
     backward = np.array(dr.grad(step)) / same.sum()
     np.testing.assert_allclose(backward, (differences * signs[same]).mean(), rtol=0, atol=tolerance)
-    found, _, _ = values(step)
+    weight, _, _ = values(step)
     dr.set_grad(step, 1)
-    np.testing.assert_allclose(np.array(dr.forward_to(found))[same], differences, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(np.array(dr.forward_to(weight))[same], differences, rtol=0, atol=tolerance)

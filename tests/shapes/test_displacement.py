@@ -109,8 +109,8 @@ class Truth:
         return np.sin(3 * s) * np.cos(2 * t) if self.kind == "waves" else bilinear(np.stack([s, t], axis=1))
 
     def points(self, corner, uv):
-        found = self.surface._sampler.evaluate(corner, uv)
-        moved = found.p + SCALE * self.height(corner, uv)[:, None] * found.n
+        samples = self.surface._sampler.evaluate(corner, uv)
+        moved = samples.p + SCALE * self.height(corner, uv)[:, None] * samples.n
         return moved @ self.matrix[:3, :3].T + self.matrix[:3, 3]
 
     def normals(self, corner, uv):
@@ -119,8 +119,8 @@ class Truth:
 
 
 def assert_alike(shape, expected, atol=0.0):
-    for found, each in zip(vertices(shape), vertices(expected), strict=True):
-        np.testing.assert_allclose(found, each, rtol=0, atol=atol)
+    for loaded, other in zip(vertices(shape), vertices(expected), strict=True):
+        np.testing.assert_allclose(loaded, other, rtol=0, atol=atol)
 
 
 def locations(cage, rate=RATE, scheme=None):
@@ -167,9 +167,9 @@ def hits(shape, flags=mi.RayFlags.All):
     return along, si, np.array(si.is_valid())
 
 
-def typical(found, expected, part):
+def typical(values, expected, part):
     """How far values are off, but for so many."""
-    return np.quantile(np.linalg.norm(found - expected, axis=1), part)
+    return np.quantile(np.linalg.norm(values - expected, axis=1), part)
 
 
 @exact_llvm
@@ -199,13 +199,15 @@ def test_hits_are_on_the_displaced_surface_with_its_normals_and_derivatives(plai
     assert inside.sum() > 300
     corner, uv = cage.topology.face_offsets[face[inside]], uv[inside]
     truth = Truth(cage, kind, matrix)
-    o, d = (np.array(each).T[inside] for each in (along.o, along.d))
+    o, d = (np.array(vectors).T[inside] for vectors in (along.o, along.d))
     way = truth.points(corner, uv) - o
     on_line = np.linalg.norm(way - (way * d).sum(1, keepdims=True) * d, axis=1) < HIT
     # Some rays pass along outlines, of which each island's rim is one.
     assert on_line.mean() > 0.95
     corner, uv = corner[on_line], uv[on_line]
-    n, *slopes = (np.array(each).T[inside][on_line] for each in (si.sh_frame.n, si.dp_du, si.dp_dv, si.dn_du, si.dn_dv))
+    n, *slopes = (
+        np.array(vectors).T[inside][on_line] for vectors in (si.sh_frame.n, si.dp_du, si.dp_dv, si.dn_du, si.dn_dv)
+    )
     assert typical(n, truth.normals(corner, uv), 0.99) < HIT_NORMAL
     for axis, (dp, dn) in enumerate(zip(slopes[:2], slopes[2:], strict=True)):
         assert typical(dp, difference(truth.points, corner, uv, axis, STEP), 0.99) < HIT_DERIVATIVE
@@ -261,9 +263,12 @@ def test_flipped_normals_move_the_surface_the_same_way_and_no_height_nothing():
     cage = CAGES["creased islands"]()
     flipped, plain = (make(CAGES["cube"](), "vertex_height", flip_normals=flip) for flip in (True, False))
     np.testing.assert_array_equal(vertices(flipped)[0], vertices(plain)[0])
-    (p, n), found = vertices(load(cage, tessellation_rate=RATE)), vertices(make(cage, bitmap(), displacement_scale=0.0))
-    np.testing.assert_array_equal(found[0], p)
-    np.testing.assert_allclose(found[1], n, rtol=0, atol=SINGLE)
+    (p, n), undisplaced = (
+        vertices(load(cage, tessellation_rate=RATE)),
+        vertices(make(cage, bitmap(), displacement_scale=0.0)),
+    )
+    np.testing.assert_array_equal(undisplaced[0], p)
+    np.testing.assert_allclose(undisplaced[1], n, rtol=0, atol=SINGLE)
 
 
 @pytest.mark.usefixtures("no_other_scene")
@@ -338,13 +343,15 @@ def test_each_of_two_losses_after_one_update_has_its_gradient(by, shading, np_rn
     given, size = differentiated(parameters, by), dr.width(parameters["vertex_positions"])
     weights = [upload(mi.Float, np_rng.normal(size=size)) for _ in range(2)]
     for name in ("positions", "normals") if shading == "vertex" else ("positions",):
-        found = []
+        gradients = []
         for weight in [*weights, weights[0] + weights[1]]:
             dr.backward(dr.sum(weight * parameters[f"vertex_{name}"]))
-            found.append(np.array(dr.grad(given)).ravel())
+            gradients.append(np.array(dr.grad(given)).ravel())
             dr.clear_grad(given)
-        assert np.abs(found[0]).max() > 0
-        np.testing.assert_allclose(found[0] + found[1], found[2], rtol=0, atol=1e-4 * np.abs(found[2]).max())
+        assert np.abs(gradients[0]).max() > 0
+        np.testing.assert_allclose(
+            gradients[0] + gradients[1], gradients[2], rtol=0, atol=1e-4 * np.abs(gradients[2]).max()
+        )
 
 
 @exact_llvm
@@ -420,7 +427,7 @@ def test_the_surface_follows_what_heights_depend_on(kind, triangles):
 @pytest.mark.parametrize("triangles", TRIANGLES, ids=["even", "adaptive"])
 def test_a_texture_of_one_value_displaces_as_a_bitmap_of_that_value(triangles):
     textures = {"type": "uniform", "value": 0.3}, bitmap(np.full_like(IMAGE, 0.3))
-    assert_alike(*(make(CAGES["cube"](), each, **triangles) for each in textures), NORMAL)
+    assert_alike(*(make(CAGES["cube"](), texture, **triangles) for texture in textures), NORMAL)
 
 
 @exact_llvm
@@ -430,11 +437,11 @@ def test_hits_follow_what_heights_depend_on(kind):
     shape = make(cage, heights(kind), shading="exact")
     assign_cage(shape, other_values(cage))
     expected = make(other_values(cage), heights(kind), shading="exact")
-    (_, found, valid), (_, at, others) = hits(shape), hits(expected)
+    (_, si, valid), (_, at, others) = hits(shape), hits(expected)
     np.testing.assert_array_equal(valid, others)
     assert valid.sum() > 100
     # A few rays along outlines meet the surface elsewhere.
-    assert typical(np.array(found.sh_frame.n).T[valid], np.array(at.sh_frame.n).T[valid], 0.99) < HIT_NORMAL
+    assert typical(np.array(si.sh_frame.n).T[valid], np.array(at.sh_frame.n).T[valid], 0.99) < HIT_NORMAL
 
 
 def extraordinary(truth, corner, uv):

@@ -45,7 +45,11 @@ def icosahedron():
     corners = [(0, a, b * golden) for a in (-1, 1) for b in (-1, 1)]
     points = np.array([np.roll(corner, axis) for axis in range(3) for corner in corners])
     near = np.linalg.norm(points[:, None] - points, axis=-1) < 2.1
-    faces = [each for each in itertools.combinations(range(12), 3) if near[np.ix_(each, each)].all()]
+    faces = [
+        corner_indices
+        for corner_indices in itertools.combinations(range(12), 3)
+        if near[np.ix_(corner_indices, corner_indices)].all()
+    ]
     return ControlCage(points / 1.5, [f if np.linalg.det(points[list(f)]) > 0 else f[::-1] for f in faces])
 
 
@@ -140,10 +144,12 @@ def placed_at(surface, uv, p):
     places = [
         (e, c) for e, size in enumerate(surface.patches.elements.face_sizes) for c in range(1 if size == 4 else size)
     ]
-    found = [surface.evaluate(element, uv, corner) for element, corner in places]
-    off = np.array([np.linalg.norm(each.p - p, axis=1) for each in found])
+    at_places = [surface.evaluate(element, uv, corner) for element, corner in places]
+    off = np.array([np.linalg.norm(samples.p - p, axis=1) for samples in at_places])
     nearest = off.argmin(axis=0), np.arange(len(p))
-    n, dp_du, dp_dv = (np.array([getattr(each, name) for each in found])[nearest] for name in ("n", "dp_du", "dp_dv"))
+    n, dp_du, dp_dv = (
+        np.array([getattr(samples, name) for samples in at_places])[nearest] for name in ("n", "dp_du", "dp_dv")
+    )
     return off[nearest], n, dp_du, dp_dv
 
 
@@ -165,8 +171,8 @@ def test_hits_are_those_of_the_limit_surface(scheme, shift):
     assert (aside < 5 * rounding).all()
     normals, derivatives = [(si.n, n), (si.sh_frame.n, n)], [(si.dp_du, dp_du), (si.dp_dv, dp_dv)]
     for pairs, tolerance in ((normals, NORMAL), (derivatives, DERIVATIVE)):
-        for found, expected in pairs:
-            assert np.abs(rows(found) - expected)[on_surface].max() < max(tolerance, 10 * rounding)
+        for at_hits, expected in pairs:
+            assert np.abs(rows(at_hits) - expected)[on_surface].max() < max(tolerance, 10 * rounding)
 
 
 def test_rays_through_folds_are_led_no_farther_than_triangles_are_large_and_as_their_mirror_images(np_rng):
@@ -177,12 +183,12 @@ def test_rays_through_folds_are_led_no_farther_than_triangles_are_large_and_as_t
     d = np_rng.uniform(low, high, o.shape) - o
     d /= np.linalg.norm(d, axis=1)[:, None]
 
-    def found(mirror, shading="exact"):
+    def met_by_rays(mirror, shading="exact"):
         to_world = mi.ScalarTransform4f().scale(mirror)
         shape = make(cage, tessellation_rate=1, to_world=to_world, shading=shading)
         return hits(shape, rays(o * mirror, d * mirror))
 
-    exact, mirrored, coarse = found([1, 1, 1]), found([-1, 1, 1]), found([1, 1, 1], "vertex")
+    exact, mirrored, coarse = met_by_rays([1, 1, 1]), met_by_rays([-1, 1, 1]), met_by_rays([1, 1, 1], "vertex")
     met = np.array(coarse.is_valid())
     assert met.mean() > 0.3
     np.testing.assert_array_equal(np.array(exact.is_valid()), met)
@@ -251,7 +257,9 @@ def test_no_facet_is_dark_on_a_convex_surface(name, integrator, light):
     rates, given = (FINE, 1, 2), {"scheme": scheme, "bsdf": matte()}
     shapes = (make(cage(), tessellation_rate=rate, **given) for rate in rates)
     fine, *coarse = (hits(shape, camera_rays(), mi.RayFlags.All) for shape in shapes)
-    lit, *pictures = (each.mean(axis=2) for each in images(rates, cage(), given, integrator, light or sky(), spp=64))
+    lit, *pictures = (
+        picture.mean(axis=2) for picture in images(rates, cage(), given, integrator, light or sky(), spp=64)
+    )
     for si, seen in zip(coarse, pictures, strict=True):
         where = inside(si, fine).reshape(seen.shape)
         assert seen[where].sum() == pytest.approx(lit[where].sum(), rel=ENERGY)
@@ -262,8 +270,8 @@ def test_no_facet_is_dark_on_a_convex_surface(name, integrator, light):
 @pytest.mark.parametrize("rate", [1, 2])
 def test_a_bowl_seen_from_inside_does_not_shade_itself(rate):
     integrator, view = {"type": "path", "max_depth": 6}, {"origin": (0.1, -1, 3)}
-    found = images((rate, 16), bowl(), {"bsdf": matte()}, integrator, view=view, spp=64)
-    seen, fine = (each.mean(axis=2) for each in found)
+    pictures = images((rate, 16), bowl(), {"bsdf": matte()}, integrator, view=view, spp=64)
+    seen, fine = (picture.mean(axis=2) for picture in pictures)
     assert seen.mean() == pytest.approx(fine.mean(), rel=ENERGY)
     # Noise of 64 samples; a false shadow would halve a pixel.
     assert np.abs(seen - fine).max() < 0.25 * fine.mean()
@@ -374,8 +382,8 @@ def test_other_variants_have_the_same_normals_and_materials_of_attributes(varian
     # The samplers differ, but not by more than a pixel, over which normals change by 0.1.
     np.testing.assert_allclose(normals(), expected, atol=0.15)
     si = hits(make(cube()), down(0.13, 0.21, 4))
-    found = LimitSurface(cube()).evaluate([1], rows(si.uv))
-    np.testing.assert_allclose(np.ravel(np.array(si.n)), found.n[0], atol=NORMAL)
+    at = LimitSurface(cube()).evaluate([1], rows(si.uv))
+    np.testing.assert_allclose(np.ravel(np.array(si.n)), at.n[0], atol=NORMAL)
     coloured = {"type": "diffuse", "reflectance": attribute("colour")}
     bsdf = {"type": "blendbsdf", "weight": attribute("heat"), "one": coloured, "two": {"type": "diffuse"}}
     coarse, fine = images((1, 32), cube(), {**heat_and_colour(), "bsdf": bsdf}, view={"fov": 12}, spp=8)
@@ -403,7 +411,7 @@ def test_emitters_light_a_floor_whichever_strategy_finds_them():
     shape = make(cube(), tessellation_rate=1, emitter=light())
     view, rough = {"origin": (0, -4, 1), "target": (0, 0, -1.2), "fov": 12}, {"type": "roughconductor", "alpha": 0.3}
     strategies = [{"type": "direct", "emitter_samples": e, "bsdf_samples": b} for e, b in ((1, 0), (0, 1), (1, 1))]
-    means = [image(shape, each, DARK, view, spp=256, floor=floor(bsdf=rough)).mean() for each in strategies]
+    means = [image(shape, strategy, DARK, view, spp=256, floor=floor(bsdf=rough)).mean() for strategy in strategies]
     assert means == pytest.approx([means[2]] * 3, rel=ENERGY)
     # The ray goes on from where it has hit: from before the triangle, it would hit it for ever.
     for integrator in ("path", "direct"):
@@ -436,9 +444,9 @@ FOG = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 1.0}
     ids=["glass", "fog"],
 )
 def test_light_passes_through(matter, integrator):
-    found = images((8, 32), cube(), matter, {"type": integrator, "max_depth": 8}, sky(), {"fov": 12}, spp=64)
-    assert np.isfinite(found[0]).all()
-    assert found[0].mean() == pytest.approx(found[1].mean(), rel=2 * ENERGY)
+    pictures = images((8, 32), cube(), matter, {"type": integrator, "max_depth": 8}, sky(), {"fov": 12}, spp=64)
+    assert np.isfinite(pictures[0]).all()
+    assert pictures[0].mean() == pytest.approx(pictures[1].mean(), rel=2 * ENERGY)
 
 
 @pytest.mark.parametrize(("kind", "tolerance"), [("instance", 10 * NORMAL), ("merge", NORMAL)])
@@ -452,12 +460,12 @@ def test_instances_and_merged_shapes_are_met_as_others(kind, tolerance):
     else:
         aside = make(cube(), to_world=mi.ScalarTransform4f().translate([9, 0, 0]))
         scene = scene_with(merged={"type": "merge", "aside": aside, "placed": placed})
-    found, expected = scene.ray_intersect(seen_along), hits(placed, seen_along, mi.RayFlags.All)
-    seen = inside(found, expected)
+    si, expected = scene.ray_intersect(seen_along), hits(placed, seen_along, mi.RayFlags.All)
+    seen = inside(si, expected)
     assert seen.sum() > RESOLUTION
-    np.testing.assert_allclose(rows(found.sh_frame.n)[seen], rows(expected.sh_frame.n)[seen], atol=tolerance)
-    np.testing.assert_allclose(rows(found.uv)[seen], rows(expected.uv)[seen], atol=DERIVATIVE)
-    np.testing.assert_allclose(rows(found.dp_du)[seen], rows(expected.dp_du)[seen], atol=DERIVATIVE)
+    np.testing.assert_allclose(rows(si.sh_frame.n)[seen], rows(expected.sh_frame.n)[seen], atol=tolerance)
+    np.testing.assert_allclose(rows(si.uv)[seen], rows(expected.uv)[seen], atol=DERIVATIVE)
+    np.testing.assert_allclose(rows(si.dp_du)[seen], rows(expected.dp_du)[seen], atol=DERIVATIVE)
 
 
 def test_aov_shows_the_surface():
@@ -514,9 +522,9 @@ def test_derivatives_of_normals_are_differences_wherever_the_shape_is_placed(mat
     n = normals(uv)
     si = hits(shape, rays_onto(surface.evaluate(1, uv).p @ linear.T + offset, n))
     np.testing.assert_allclose(rows(si.sh_frame.n), n, atol=2 * NORMAL)
-    for axis, found in zip(step * np.eye(2), (si.dn_du, si.dn_dv), strict=True):
+    for axis, change in zip(step * np.eye(2), (si.dn_du, si.dn_dv), strict=True):
         expected = (normals(uv + axis) - normals(uv - axis)) / (2 * step)
-        np.testing.assert_allclose(rows(found), expected, atol=tolerance)
+        np.testing.assert_allclose(rows(change), expected, atol=tolerance)
 
 
 def test_shapes_of_equal_cages_share_coefficients_until_one_moves():
@@ -566,7 +574,7 @@ def test_derivatives_of_hits_by_parameters_are_differences(by, np_rng):
 
     def loss():
         si = scene.ray_intersect(seen_along, int(mi.RayFlags.All), coherent=True)
-        return sum(dr.sum(dr.dot(w, each)) for w, each in zip(weights, (si.p, si.sh_frame.n), strict=True))
+        return sum(dr.sum(dr.dot(w, vector)) for w, vector in zip(weights, (si.p, si.sh_frame.n), strict=True))
 
     backward, forward, difference = (derivative(mode, assign, loss, 3e-3) for mode in MODES)
     assert abs(difference) > 0.1

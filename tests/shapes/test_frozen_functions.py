@@ -57,8 +57,8 @@ def test_updates_inside_of_a_frozen_function_are_recorded(shading, by):
     frozen, (scene, parameters) = dr.freeze(step), loaded(shading, **NEEDED.get(by, {}))
     # Mitsuba renders what was recorded twice: once more when arrays have become the function's own.
     for number in range(1, 3):
-        found = np.array(frozen(scene, parameters, value(by, number)))
-        np.testing.assert_array_equal(found, expected[number - 1])
+        picture = np.array(frozen(scene, parameters, value(by, number)))
+        np.testing.assert_array_equal(picture, expected[number - 1])
     assert frozen.n_recordings == 2
     if by == "colour":
         np.testing.assert_allclose(np.array(frozen(scene, parameters, value(by, 3))), expected[2], rtol=ORDER_OF_SUMS)
@@ -91,8 +91,8 @@ def test_gradients_of_a_frozen_picture_reach_what_was_updated_before(shading, by
     for number in range(1, 4):
         expected = gradient(picture, *plain, number)
         assert abs(expected).max() > 0
-        found = gradient(function, *frozen, number)
-        np.testing.assert_allclose(found, expected, atol=ORDER_OF_SUMS * abs(expected).max())
+        frozen_gradient = gradient(function, *frozen, number)
+        np.testing.assert_allclose(frozen_gradient, expected, atol=ORDER_OF_SUMS * abs(expected).max())
     assert function.n_recordings == 2
 
 
@@ -108,8 +108,8 @@ def test_steps_of_colours_are_frozen_whole(shading):
     for number in range(1, 4):
         seed = dr.opaque(mi.UInt32, number)
         expected = np.array(step(*plain, value("colour", number), seed))
-        found = np.array(function(*frozen, value("colour", number), seed))
-        np.testing.assert_allclose(found, expected, atol=ORDER_OF_SUMS * abs(expected).max())
+        frozen_gradient = np.array(function(*frozen, value("colour", number), seed))
+        np.testing.assert_allclose(frozen_gradient, expected, atol=ORDER_OF_SUMS * abs(expected).max())
     assert function.n_recordings == 2
 
 

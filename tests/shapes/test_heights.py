@@ -46,7 +46,7 @@ def attached_slopes(heights, s, t):
 
 
 def slopes(heights, s, t):
-    return np.array([np.array(each) for each in attached_slopes(heights, *arrays(s, t))])
+    return np.array([np.array(slope) for slope in attached_slopes(heights, *arrays(s, t))])
 
 
 def differences(heights, s, t):
@@ -87,11 +87,11 @@ def test_slopes_of_a_bitmap_turn_with_texture_coordinates(turn):
     for axis in range(2):
         given = arrays(*inside[:2])
         dr.enable_grad(given[axis])
-        found = []
+        by_axis = []
         for slope in attached_slopes(heights, *given):
             dr.set_grad(given[axis], 1)
-            found.append(np.array(dr.forward_to(slope, flags=dr.ADFlag.ClearInterior)))
-        np.testing.assert_allclose(found, np.repeat(expected[:, axis, None], 40, axis=1), rtol=0, atol=SECOND)
+            by_axis.append(np.array(dr.forward_to(slope, flags=dr.ADFlag.ClearInterior)))
+        np.testing.assert_allclose(by_axis, np.repeat(expected[:, axis, None], 40, axis=1), rtol=0, atol=SECOND)
 
 
 @every_variant
@@ -114,7 +114,7 @@ def test_ranges_are_those_of_texels_of_luminances_of_samples_and_of_an_attribute
     assert low <= values.min() < values.max() <= high
     colours = heights_of(bitmap(np.random.default_rng(8).random((3, 5, 3)).astype(np.float32)))
     # At texels' centres the texture has their values.
-    s, t = (each.ravel() for each in np.meshgrid((np.arange(5) + 0.5) / 5, (np.arange(3) + 0.5) / 3))
+    s, t = (grid.ravel() for grid in np.meshgrid((np.arange(5) + 0.5) / 5, (np.arange(3) + 0.5) / 3))
     values = np.array(colours.height(arrays(s, t)))
     is_range(colours, values.min(), values.max(), abs=1e-6)
     assert heights_of(waves()).range()[1] == pytest.approx(1, abs=1e-3)
@@ -147,9 +147,9 @@ def test_normals_turn_when_texture_coordinates_slide_over_a_bitmap():
 
     step = mi.Float(0)
     dr.enable_grad(step)
-    found = normals(step)
+    moving = normals(step)
     dr.set_grad(step, 1)
-    derivative = np.array(dr.forward_to(found))
+    derivative = np.array(dr.forward_to(moving))
     # Over some texels, as slopes jump from one to the next.
     expected = (np.array(normals(SLIDE)) - np.array(normals(-SLIDE))) / (2 * SLIDE)
     assert np.abs(derivative - expected).mean() < 0.2 * np.abs(expected).mean()

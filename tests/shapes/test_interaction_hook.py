@@ -183,7 +183,7 @@ def test_errors_go_with_their_last_name(monkeypatch):
     try:
         with contextlib.suppress(AnswerError):
             mi.render(scene, spp=1)
-        assert {each() for each in alive} == {None}
+        assert {reference() for reference in alive} == {None}
     finally:
         gc.enable()
 
@@ -215,11 +215,11 @@ def test_mitsubas_own_errors_are_those_of_vertex_shading():
     def errors(shading):
         shape = make(shading=shading)
         scene = scene_with(shape=shape)
-        found, outside = (scene.ray_intersect_preliminary(each) for each in (rays, top))
+        preliminary, outside = (scene.ray_intersect_preliminary(ray) for ray in (rays, top))
         outside.prim_index = mi.UInt32(100000)
         for ask in (
-            lambda: shape.compute_surface_interaction(rays, found, flags),
-            lambda: shape.compute_surface_interaction(rays, found, active=mi.Mask([True, False])),
+            lambda: shape.compute_surface_interaction(rays, preliminary, flags),
+            lambda: shape.compute_surface_interaction(rays, preliminary, active=mi.Mask([True, False])),
             lambda: shape.compute_surface_interaction(top, outside),
             lambda: shape.eval_attribute_1("face_element", scene.ray_intersect(rays), mi.Mask([True, False])),
         ):
@@ -299,14 +299,14 @@ def test_frozen_functions_render_as_others(parameters):
 @pytest.fixture
 def asked(monkeypatch, no_other_scene):  # noqa: ARG001
     """Shapes that are asked for interactions, one after the other. Shapes of earlier scenes would be asked as well."""
-    found, complete = [], exact_shading.ExactShading.complete
+    shadings, complete = [], exact_shading.ExactShading.complete
 
     def note(shading, *arguments):
-        found.append(shading)
+        shadings.append(shading)
         complete(shading, *arguments)
 
     complete_by(monkeypatch, note)
-    return found
+    return shadings
 
 
 def instance(group, place):
@@ -347,7 +347,7 @@ def test_groups_side_by_side_are_as_each_alone():
         instances = {f"of{g}": instance(f"group{g}", 3 * g) for g in groups}
         return scene_with(**{f"group{g}": members(g, 1) for g in groups}, **instances)
 
-    def found(scene):
+    def met_in(scene):
         parameters = mi.traverse(scene)
         dr.enable_grad(parameters[key])
         parameters.update()
@@ -356,11 +356,11 @@ def test_groups_side_by_side_are_as_each_alone():
         values, gradient = (*si.p, *si.sh_frame.n, *si.dp_du, si.is_valid()), dr.grad(parameters[key])
         # In one kernel.
         dr.eval(values, gradient)
-        return np.array([np.array(each) for each in values]), np.array(gradient)
+        return np.array([np.array(value) for value in values]), np.array(gradient)
 
     both = scene_of(0, 1)
     normals = np.array(dr.freeze(lambda scene, ray: scene.ray_intersect(ray).sh_frame.n)(both, ray))
-    (values, gradient), (expected, expected_gradient) = found(both), found(scene_of(1))
+    (values, gradient), (expected, expected_gradient) = met_in(both), met_in(scene_of(1))
     assert expected[-1].mean() > 0.5
     assert np.abs(expected_gradient).max() > 0.1
     np.testing.assert_allclose(values, expected, atol=1e-5)
@@ -399,28 +399,28 @@ def test_shapes_live_as_long_as_their_scenes():
     scene, top = scene_with(a=shapes[0], b=shapes[1]), down(*TOP)
     before = rows(scene.ray_intersect(top).sh_frame.n)
     assert np.linalg.norm(before - [0, 0, 1]) > 0.05
-    alive = [weakref.ref(each) for shape in shapes for each in (shape, shape._exact)]
+    alive = [weakref.ref(reference) for shape in shapes for reference in (shape, shape._exact)]
     del shapes
     gc.collect()
-    assert None not in [each() for each in alive]
+    assert None not in [reference() for reference in alive]
     np.testing.assert_array_equal(rows(scene.ray_intersect(top).sh_frame.n), before)
     del scene
     gc.collect()
-    assert [each() for each in alive] == [None] * 4
+    assert [reference() for reference in alive] == [None] * 4
 
 
 @llvm
 def test_variants_side_by_side():
     names = [name for name in mi.variants() if name in ("llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono")]
-    shapes, found = {}, {}
+    shapes, normals_of = {}, {}
     for name in names:
         mi.set_variant(name)
         shapes[name] = make()
     for name in reversed(names):
         mi.set_variant(name)
-        found[name] = rows(interaction(shapes[name]).sh_frame.n)
-    for normals in found.values():
-        np.testing.assert_allclose(normals, found["llvm_ad_rgb"], atol=1e-6)
+        normals_of[name] = rows(interaction(shapes[name]).sh_frame.n)
+    for normals in normals_of.values():
+        np.testing.assert_allclose(normals, normals_of["llvm_ad_rgb"], atol=1e-6)
 
 
 @llvm
@@ -431,8 +431,8 @@ def test_inactive_lanes_may_have_any_triangle():
     is_hit = preliminary.is_valid()
     assert np.array(is_hit).tolist() == [True, False]
     preliminary.prim_index = dr.select(is_hit, preliminary.prim_index, 0xFFFFFFF0)
-    found = shape.compute_surface_interaction(ray, preliminary, mi.RayFlags.All, is_hit)
-    np.testing.assert_array_equal(rows(found.n)[0], rows(scene.ray_intersect(ray).n)[0])
+    si = shape.compute_surface_interaction(ray, preliminary, mi.RayFlags.All, is_hit)
+    np.testing.assert_array_equal(rows(si.n)[0], rows(scene.ray_intersect(ray).n)[0])
 
 
 @every_array_variant
@@ -537,10 +537,10 @@ def test_the_trial_notices_what_differs(kind, message):
                 si.uv = uv
 
         def attribute(self, *arguments):
-            found = None
+            value = None
             with contextlib.suppress(ArithmeticError):
-                found = self.trial.attribute(*arguments)
-            return None if kind == "forgetful" else found
+                value = self.trial.attribute(*arguments)
+            return None if kind == "forgetful" else value
 
     def attach(shape, trial):
         kept.append(Answers(trial))

@@ -62,9 +62,9 @@ def load(shapes, **options):
     return mi.load_dict({"type": "scene", **named}, **options).shapes()
 
 
-def assert_as_if_alone(shape, found, i):
+def assert_as_if_alone(shape, shapes, i):
     expected = buffers(mi.load_dict(placed(shape, i)))
-    loaded = buffers(found[i])
+    loaded = buffers(shapes[i])
     assert loaded.keys() == expected.keys()
     for name, values in expected.items():
         np.testing.assert_allclose(loaded[name], values, rtol=0, atol=SINGLE, err_msg=name)
@@ -74,10 +74,10 @@ def assert_as_if_alone(shape, found, i):
 @pytest.mark.parametrize(("count", "parallel"), [(MANY, True), (SOME, False)], ids=["parallel", "one by one"])
 def test_many_shapes_load(count, parallel):
     shape = of(cube())
-    found = load([shape] * count, parallel=parallel)
-    assert len(found) == count
+    shapes = load([shape] * count, parallel=parallel)
+    assert len(shapes) == count
     for i in (0, count // 2, count - 1):
-        assert_as_if_alone(shape, found, i)
+        assert_as_if_alone(shape, shapes, i)
 
 
 @exact_llvm
@@ -92,10 +92,10 @@ def test_what_waits_within_constructors_loads():
     ]
     cage = coloured(cube(), height=np.linspace(0, 1, 8)[:, None])
     shapes = [of(cage, **kinds[i % len(kinds)]) for i in range(SOME)]
-    found = load(shapes)
-    assert len(found) == SOME
+    loaded = load(shapes)
+    assert len(loaded) == SOME
     for i in range(SOME - len(kinds), SOME):
-        assert_as_if_alone(shapes[i], found, i)
+        assert_as_if_alone(shapes[i], loaded, i)
 
 
 @llvm
@@ -143,10 +143,10 @@ def test_a_constructor_too_deep_runs_in_its_own_thread():
 
 @scalar
 def test_the_collector_rests_while_a_shape_is_made_and_is_as_it_was_afterwards(monkeypatch):
-    read_parameters, found = subdivision_shape.read_parameters, []
+    read_parameters, enabled = subdivision_shape.read_parameters, []
 
     def noted(props):
-        found.append(gc.isenabled())
+        enabled.append(gc.isenabled())
         return read_parameters(props)
 
     monkeypatch.setattr(subdivision_shape, "read_parameters", noted)
@@ -162,7 +162,7 @@ def test_the_collector_rests_while_a_shape_is_made_and_is_as_it_was_afterwards(m
         assert not gc.isenabled()
     finally:
         gc.enable()
-    assert found == [False] * 3
+    assert enabled == [False] * 3
 
 
 def test_the_collector_runs_again_after_pauses_that_overlap():
@@ -189,9 +189,9 @@ def test_the_collector_runs_again_after_pauses_that_overlap():
 def tables(shape):
     """What shapes of one topology share; that of exact shading only where it has been asked for."""
     surface = shape._parameters.surface
-    found = [surface.cage.structure, surface.patches, shape._mesh.table, shape._mesh.layout]
-    found += [surface.channel(name).layout for name in surface.attribute_names]
-    return [*found, surface.pieces()] if shape._exact is not None else found
+    shared = [surface.cage.structure, surface.patches, shape._mesh.table, shape._mesh.layout]
+    shared += [surface.channel(name).layout for name in surface.attribute_names]
+    return [*shared, surface.pieces()] if shape._exact is not None else shared
 
 
 @every_variant
@@ -202,11 +202,11 @@ def test_shapes_of_equal_topology_share_all_but_positions(shading, rate, tmp_pat
     moved = cage.with_positions(cage.positions + np_rng.normal(size=cage.positions.shape) * 0.1)
     paths = [str(tmp_path / f"{name}.obj") for name in ("one", "other")]
     # An OBJ file has no place for colours.
-    for path, each in zip(paths, (cage, moved), strict=True):
+    for path, given in zip(paths, (cage, moved), strict=True):
         with pytest.warns(CageWarning, match="no place for attribute"):
-            each.save(path)
+            given.save(path)
     options = {"shading": shading, "tessellation_rate": rate}
-    from_arrays = [mi.load_dict({**of(each), **options}) for each in (cage, moved, coloured(cage, 1))]
+    from_arrays = [mi.load_dict({**of(given), **options}) for given in (cage, moved, coloured(cage, 1))]
     files = [from_file(path, **options) for path in (*paths, paths[0])]
     for first, *others in (from_arrays, files):
         for shape in others:
@@ -242,7 +242,7 @@ def test_shapes_of_other_tags_or_rules_share_no_patches(change):
 @every_variant
 def test_shapes_of_another_rate_or_scheme_share_no_tessellation():
     options = {}, {"tessellation_rate": 3}, {"scheme": "doo_sabin"}
-    shapes = [mi.load_dict({**of(cube()), **each}) for each in options]
+    shapes = [mi.load_dict({**of(cube()), **option}) for option in options]
     assert len({id(shape._mesh.table) for shape in shapes}) == 3
     patches = [shape._parameters.surface.patches for shape in shapes]
     assert patches[0] is patches[1] is not patches[2]
@@ -267,13 +267,13 @@ def test_shapes_of_equal_cages_share_their_vertices_until_control_points_of_one_
 def test_nothing_is_kept_when_the_last_shape_has_gone():
     shape = of(coloured(named_cages.torus(4, 3)), shading="exact")
     one, two = mi.load_dict(shape), mi.load_dict(shape)
-    seen = [weakref.ref(each) for each in tables(one)]
+    seen = [weakref.ref(reference) for reference in tables(one)]
     del one
     gc.collect()
-    assert None not in [each() for each in seen]
+    assert None not in [reference() for reference in seen]
     del two
     gc.collect()
-    assert [each() for each in seen] == [None] * len(seen)
+    assert [reference() for reference in seen] == [None] * len(seen)
 
 
 # Files
@@ -319,7 +319,7 @@ def test_a_file_is_read_once_until_it_changes_and_warned_of_by_each_shape(tmp_pa
 
 
 def test_only_usd_files_refer_to_others_which_may_change_alone():
-    assert {suffix for suffix, each in FORMATS.items() if not each.refers_to_files} == {".obj", ".ply"}
+    assert {suffix for suffix, file_format in FORMATS.items() if not file_format.refers_to_files} == {".obj", ".ply"}
 
 
 @llvm
@@ -334,7 +334,7 @@ def test_triangles_that_are_chosen_anew_keep_derivatives():
 @every_variant
 def test_shapes_of_equal_attributes_share_them_until_those_of_one_change():
     cage, is_jit = with_attributes(), dr.is_jit_v(mi.Float)
-    shapes = [made(each) for each in (cage, cage.with_positions(-cage.positions), coloured(cube(), 1))]
+    shapes = [made(given) for given in (cage, cage.with_positions(-cage.positions), coloured(cube(), 1))]
     one, two, other = map(mi.traverse, shapes)
     for name in ("colour", "texcoords", "weight", "label"):
         assert not is_jit or one[f"cage_{name}"].index == two[f"cage_{name}"].index

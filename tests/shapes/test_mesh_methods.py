@@ -45,8 +45,8 @@ def numbers(value):
     return np.array(dr.detach(value)).ravel()
 
 
-def close(found, expected, atol=SINGLE):
-    np.testing.assert_allclose(numbers(found), expected, atol=atol)
+def close(value, expected, atol=SINGLE):
+    np.testing.assert_allclose(numbers(value), expected, atol=atol)
 
 
 def refused(message, call, *arguments):
@@ -140,15 +140,15 @@ def normals_and_texcoords_at_vertices(at):
 def areas_and_samples(at):
     assert numbers(at.shape.surface_area())[0] == pytest.approx(at.surface.area(), rel=0.05)
     u, area = mi.Point2f(0.3, 0.6), numbers(at.shape.surface_area())
-    found = at.shape.sample_position(0, u)
-    close(found.pdf, 1 / area)
-    close(at.shape.pdf_position(found), 1 / area)
+    sample = at.shape.sample_position(0, u)
+    close(sample.pdf, 1 / area)
+    close(at.shape.pdf_position(sample), 1 / area)
     # On a triangle, not further from the surface than its middle.
-    assert at.surface.closest_point(numbers(found.p)[None]).distance[0] < 0.1
+    assert at.surface.closest_point(numbers(sample.p)[None]).distance[0] < 0.1
     viewer = dr.zeros(mi.Interaction3f)
     viewer.p = mi.Point3f(CENTRE)
     direction = at.shape.sample_direction(viewer, u)
-    close(direction.p, numbers(found.p))
+    close(direction.p, numbers(sample.p))
     close(at.shape.pdf_direction(viewer, direction), numbers(direction.pdf), 1e-4)
 
 
@@ -178,9 +178,9 @@ def silhouettes(at):
 def write_ply(at):
     path = str(at.folder / "mesh.ply")
     at.shape.write_ply(path)
-    found = mi.load_dict({"type": "ply", "filename": path})
-    close(found.vertex_positions_buffer(), numbers(at.shape.vertex_positions_buffer()))
-    close(found.attribute_buffer("vertex_color"), numbers(at.shape.attribute_buffer("vertex_color")))
+    ply = mi.load_dict({"type": "ply", "filename": path})
+    close(ply.vertex_positions_buffer(), numbers(at.shape.vertex_positions_buffer()))
+    close(ply.attribute_buffer("vertex_color"), numbers(at.shape.attribute_buffer("vertex_color")))
 
 
 def not_of_meshes(at):
@@ -197,7 +197,7 @@ def counts(at):
     assert {at.shape.face_count(), at.shape.primitive_count(), at.shape.effective_primitive_count()} == {faces}
     assert len(at.shape.vertex_positions_buffer()) == 3 * at.shape.vertex_count()
     close(at.shape.vertex_position(3), numbers(at.shape.vertex_positions_buffer())[9:12])
-    corners = [numbers(at.shape.vertex_position(int(each))) for each in numbers(at.shape.face_indices(0))]
+    corners = [numbers(at.shape.vertex_position(int(vertex))) for vertex in numbers(at.shape.face_indices(0))]
     n = np.cross(corners[1] - corners[0], corners[2] - corners[0])
     close(at.shape.face_normal(0), n / np.linalg.norm(n), 10 * SINGLE)
 

@@ -20,8 +20,8 @@ ROWS = (*PARAMETERS, *STATE_PARAMETERS)
 def shown_by(**parameters):
     """Flags by name of what `traverse` shows, but for parameters of objects within."""
     cage = cube(texcoords=cube().positions[:, :2], attributes={"NAME": np.ones((8, 1))})
-    found = mi.traverse(load(cage, **parameters))
-    return {name: found.flags(name) for name in found.keys() if "." not in name}  # noqa: SIM118
+    shown = mi.traverse(load(cage, **parameters))
+    return {name: shown.flags(name) for name in shown.keys() if "." not in name}  # noqa: SIM118
 
 
 @every_variant

@@ -108,7 +108,7 @@ def test_control_points_of_a_far_cage_keep_their_digits_where_they_stay():
 @llvm
 def test_derivatives_by_control_points_are_the_same_far_away(shading, mode):
     """Coordinates that stay as they are loaded had none, so that no fit moved a far cage."""
-    found, cage = [], named_cages.extraordinary(5)
+    derivatives, cage = [], named_cages.extraordinary(5)
     for shift in (0, SHIFT):
         parameters = mi.traverse(make(cage.with_positions(cage.positions + shift), shading=shading))
         points = parameters["control_points"]
@@ -117,12 +117,12 @@ def test_derivatives_by_control_points_are_the_same_far_away(shading, mode):
         weights = dr.linspace(mi.Float, -1, 1, len(parameters["vertex_positions"]))
         if mode == "backward":
             dr.backward(dr.sum(parameters["vertex_positions"] * weights))
-            found.append(np.array(dr.grad(points)))
+            derivatives.append(np.array(dr.grad(points)))
         else:
             dr.set_grad(points, dr.linspace(mi.Float, -1, 1, len(points)))
-            found.append(np.array(dr.forward_to(parameters["vertex_positions"])))
-    assert np.abs(found[0]).max() > 0.1
-    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=10 * SINGLE * np.abs(found[0]).max())
+            derivatives.append(np.array(dr.forward_to(parameters["vertex_positions"])))
+    assert np.abs(derivatives[0]).max() > 0.1
+    np.testing.assert_allclose(derivatives[1], derivatives[0], rtol=0, atol=10 * SINGLE * np.abs(derivatives[0]).max())
 
 
 @pytest.mark.parametrize("name", ["far", "turned", "mirrored"])

@@ -80,20 +80,20 @@ def test_each_view_has_its_gradients_however_they_are_asked_for(integrator, shad
     expected = gradient_by(scene, "updates", kept=False)
     assert np.abs(expected).max() > 0
     for case in cases:
-        found = gradient_by(scene, *case)
-        assert np.linalg.norm(found - expected) <= ROUNDING * np.linalg.norm(expected), case
+        gradient = gradient_by(scene, *case)
+        assert np.linalg.norm(gradient - expected) <= ROUNDING * np.linalg.norm(expected), case
 
 
 def test_an_optimiser_needs_one_update_for_all_views():
     scene = views_of("prb")
-    parameters, found = mi.traverse(scene), []
+    parameters, gradients = mi.traverse(scene), []
     optimiser = mi.ad.SGD(lr=1, params={KEY: parameters[KEY]})
     parameters.update(optimiser)
     for view in range(VIEWS):
         dr.backward(loss_at(scene, parameters, view))
-        found.append(np.array(dr.grad(optimiser[KEY])))
-    np.testing.assert_allclose(found[-1], gradient_by(scene, "sum", kept=False), rtol=ROUNDING, atol=ROUNDING)
-    assert np.abs(found[1] - found[0]).max() > 1e-4
+        gradients.append(np.array(dr.grad(optimiser[KEY])))
+    np.testing.assert_allclose(gradients[-1], gradient_by(scene, "sum", kept=False), rtol=ROUNDING, atol=ROUNDING)
+    assert np.abs(gradients[1] - gradients[0]).max() > 1e-4
 
 
 def test_what_users_assign_to_vertices_stays_when_gradients_pass():
@@ -163,10 +163,10 @@ def test_losses_of_views_are_those_of_the_views():
         seen.append(view)
         return (view + 1) * loss_of(image)
 
-    found = msub.loss_of_views(scene, parameters, loss, [1, 0], seed=5, spp=4)
+    total = msub.loss_of_views(scene, parameters, loss, [1, 0], seed=5, spp=4)
     images = [mi.render(scene, parameters, sensor=s, seed=10 + view, spp=4) for view, s in enumerate([1, 0])]
     assert seen == [0, 1]
-    assert dr.allclose(found, loss_of(images[0]) + 2 * loss_of(images[1]))
+    assert dr.allclose(total, loss_of(images[0]) + 2 * loss_of(images[1]))
     with pytest.raises(ValueError, match="no views: expected a scene with sensors"):
         msub.loss_of_views(mi.load_dict({"type": "scene"}), parameters, loss)
 

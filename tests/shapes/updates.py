@@ -28,7 +28,7 @@ def assign_cage(shape, cage):
     parameters = mi.traverse(shape)
     values = {"texcoords": cage.texcoords, **cage.attributes}
     kinds = {name: type(parameters[f"cage_{name}"]) for name in values}
-    update(parameters, {f"cage_{name}": upload(kinds[name], each.values) for name, each in values.items()})
+    update(parameters, {f"cage_{name}": upload(kinds[name], attribute.values) for name, attribute in values.items()})
 
 
 MODES = ("backward", "forward", "difference")

@@ -69,7 +69,7 @@ class MeshBuffers:
         self._on_backward = on_backward
         self.has_texcoords = TEXCOORDS in attributes.values
         # References that keep shared arrays alive.
-        self._held: dict[str, SharedArray] = {}
+        self._held: dict[str, SharedArray | LaterArrays] = {}
         is_jit = dr.is_jit_v(variant.Float)
         self._types = ArrayTypes(variant.Float) if is_jit else None
         self._is_sampled = parameters.evaluator != "stabilized" or parameters.sample_offset > 0
@@ -82,10 +82,10 @@ class MeshBuffers:
         self.are_differentiable = self._kernel is not None and dr.is_diff_v(variant.Float)
         self._computed: set[int] = set()
         self._evaluated: EvaluatedVertices | None = None
-        # None if vertices are not shared, or control points have moved.
+        # None if vertices are not shared, and after the first evaluation.
         self._loaded: LaterArrays | None = None
         if self._kernel is not None and table.vertex_count <= MOST_SHARED:
-            self._loaded = _LOADED.get((self._kernel, parameters.surface.cage), LaterArrays)
+            self._loaded = self._held["loaded"] = _LOADED.get((self._kernel, parameters.surface.cage), LaterArrays)
         # Index of each vertex of the mesh among those of the tessellation, if seams have copies. Copies are displaced
         # differently and averaged; with exact shading, only one of them is kept.
         copied, one_of_copies = attributes.surface_vertex, None
@@ -117,8 +117,7 @@ class MeshBuffers:
     ) -> dict[str, FloatBuffer]:
         """Evaluate the mesh's buffers, and update exact shading. Returns the buffers by name."""
         points, surface = self._placement.relative(control_points), self._surface
-        if moves_points:
-            self._loaded = None
+        loaded, self._loaded = None if moves_points else self._loaded, None
         if surface is not None and moves_points:
             surface.set_control_points(points)
         elif surface is not None and self.are_differentiable and dr.grad_enabled(points):
@@ -131,10 +130,9 @@ class MeshBuffers:
         if self._kernel is None:
             return self._placed(*self._on_host(points), points)
         evaluate = partial(self._kernel.evaluated, dr.detach(points))
-        evaluated: EvaluatedVertices = evaluate() if self._loaded is None else self._loaded.get(evaluate)
-        # Shared vertices are kept for frozen functions; others for a displacement, as gradients of heights may be
-        # enabled later.
-        self._evaluated = evaluated if moves or self._displaced is not None or self._loaded is not None else None
+        evaluated: EvaluatedVertices = evaluate() if loaded is None else loaded.get(evaluate)
+        # Also kept for a displacement, as gradients of heights may be enabled later.
+        self._evaluated = evaluated if moves or self._displaced is not None else None
         return self._placed(*evaluated.attached(points), points)
 
     def attached(self, control_points: FloatBuffer) -> dict[str, FloatBuffer]:
@@ -256,8 +254,8 @@ class MeshBuffers:
                 return SharedArray(None)
             return SharedArray(mapped(kind, values) if dr.is_jit_v(kind) else values.ravel())
 
-        self._held[name] = _SHARED.get((name, self._variant, *key), array)
-        return self._held[name].array
+        shared = self._held[name] = _SHARED.get((name, self._variant, *key), array)
+        return shared.array
 
 
 def require_control_points(control_points: FloatBuffer, count: int) -> None:
