@@ -35,11 +35,6 @@ class GridPart(NamedTuple):
     corners: IntArray  # (P,): a corner of each patch's element, not always the one at which the patch begins
     uv: FloatArray  # (S, 2) float64: parameters of the samples, starting at `corners`
 
-    @property
-    def vertices(self) -> IntArray:
-        """``(P, S)`` vertices of the samples of each patch."""
-        return self.first_vertex.astype(np.int64)[:, None] + self.offsets
-
 
 class UniformGrid:
     """Numbering of a uniform tessellation: the same for all surfaces over the same elements.
@@ -66,6 +61,8 @@ class UniformGrid:
         self._half, self._is_odd = rate // 2, rate % 2 == 1
         # Steps from a corner of a polygon to samples inside its grid: for an even rate, the last one is on a spoke.
         self._inside = np.arange(1, self._half + self._is_odd)
+        # Triangles of one corner of a polygon.
+        self._corner_triangles = 2 * self._half**2 + self._is_odd * (2 * self._half + 1)
 
     # Numbers of vertices
 
@@ -87,15 +84,11 @@ class UniformGrid:
     @cached_property
     def corner_vertex(self) -> NDArray[np.uint32]:
         """``(n_v,)`` number of each vertex of the topology; undefined where no face uses it."""
-        return np.cumsum(self._is_used, dtype=np.uint32) - 1
-
-    @cached_property
-    def _is_used(self) -> NDArray[np.bool_]:
-        return self.topology.vertex_half_edge >= 0
+        return np.cumsum(self.topology.vertex_half_edge >= 0, dtype=np.uint32) - 1
 
     @cached_property
     def _corner_count(self) -> int:
-        return int(np.count_nonzero(self._is_used))
+        return int(np.count_nonzero(self.topology.vertex_half_edge >= 0))
 
     def edge_start(self, corners: IntArray) -> IntArray:
         """Number of the first vertex inside the edge that begins at each corner, along the edge's lowest half-edge."""
@@ -119,7 +112,7 @@ class UniformGrid:
 
         Steps 0 and ``rate`` are the ends of the edge.
         """
-        is_forward = self._owns_edge[corners]
+        is_forward = self._are_lowest(corners)
         # Unsigned sums wrap around 2^32, so that 2^32 - 1 acts as -1.
         start = self.edge_start(corners).astype(np.uint32)
         start += np.where(is_forward, np.uint32(2**32 - 1), np.uint32(self.rate - 1))
@@ -136,11 +129,9 @@ class UniformGrid:
     def _at_corners(self, corners: IntArray) -> NDArray[np.uint32]:
         return self.corner_vertex[self.topology.face_vertices[corners]]
 
-    @cached_property
-    def _owns_edge(self) -> NDArray[np.bool_]:
-        """``(n_h,)`` whether each half-edge's element evaluates the edge: the element of the lower half-edge does."""
-        twin = self.topology.twin
-        return (twin < 0) | (twin > np.arange(len(twin), dtype=np.int32))
+    def _are_lowest(self, corners: IntArray) -> NDArray[np.bool_]:
+        """Whether the half-edges that begin at corners are the lowest of their edges, whose elements evaluate these."""
+        return self.topology.edge_half_edge[self.topology.edge[corners]] == corners
 
     def _whole_vertices(self, faces: IntArray) -> NDArray[np.uint32]:
         """``(f, S)`` vertices of whole elements, in the order of `_steps`."""
@@ -215,11 +206,6 @@ class UniformGrid:
         """``(n_f,)`` triangles of each element."""
         of_whole = (self.domain.corner_count - 2) * self.rate**2
         return np.where(self._is_whole, of_whole, self.topology.face_sizes * self._corner_triangles)
-
-    @property
-    def _corner_triangles(self) -> int:
-        """Triangles of one corner of a polygon."""
-        return 2 * self._half**2 + (2 * self._half + 1 if self._is_odd else 0)
 
     def triangles(self) -> NDArray[np.uint32]:
         """``(m, 3)`` vertices, counter-clockwise from outside, in the order of the elements."""
@@ -339,7 +325,7 @@ class UniformGrid:
     ) -> list[GridPart]:
         """The part of the samples inside edges, and that of the sample at the corners."""
         uv, steps = np.stack([along, np.zeros_like(along)], axis=1), np.arange(len(samples))
-        at_edge = np.flatnonzero(self._owns_edge[corners])
+        at_edge = np.flatnonzero(self._are_lowest(corners))
         at_vertex = np.flatnonzero(self.topology.vertex_half_edge[self.topology.face_vertices[corners]] == corners)
         inside, begin = corners[at_edge], corners[at_vertex]
         return [
@@ -364,7 +350,7 @@ class UniformGrid:
             parts.append(GridPart(samples, offsets, patches, first_vertex, corners[patches], uv[samples]))
 
         previous = t.prev[corners]
-        at_back = np.flatnonzero(self._owns_edge[previous])
+        at_back = np.flatnonzero(self._are_lowest(previous))
         add(index[self._inside, 0], r - 1 - self._inside, at_back, self.edge_start(previous[at_back]))
         if not is_whole:
             patches, first = np.arange(len(corners)), np.flatnonzero(turns == 0)
@@ -399,8 +385,9 @@ class UniformGrid:
         half_edge, uv = np.zeros(self.vertex_count, dtype=np.int64), np.zeros((self.vertex_count, 2))
         for corners in (t.face_offsets[:-1][self._is_whole], t.half_edges_of(~self._is_whole)):
             for part in self.layout(corners)[1] if len(corners) else ():
-                half_edge[part.vertices] = part.corners[:, None]
-                uv[part.vertices] = part.uv
+                vertices = part.first_vertex.astype(np.int64)[:, None] + part.offsets
+                half_edge[vertices] = part.corners[:, None]
+                uv[vertices] = part.uv
         return half_edge, uv
 
     # Other grids
