@@ -16,6 +16,7 @@ from patches.closed_cages import bumpy, mixed_torus
 from reference.refined_cages import refine_first, tagged
 
 MIXED = [[0, 2, 3, 1], [4, 5, 7], [4, 7, 6], [3, 2, 6, 7], [0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4]]
+CREASED = tagged(named_cages.cube(), creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)])
 CASES = {
     "cube": lambda: LimitSurface(named_cages.cube()),
     "valence 5": lambda: LimitSurface(named_cages.extraordinary(5, closed=False)),
@@ -24,6 +25,8 @@ CASES = {
     # Regular patches only.
     "torus": lambda: LimitSurface(bumpy(named_cages.torus(5, 4))),
     "doo_sabin": lambda: LimitSurface(bumpy(named_cages.torus(5, 4)), "doo_sabin"),
+    # Vertices on creases have copies.
+    "creased": lambda: LimitSurface(CREASED),
     "refined once": lambda: LimitSurface(bumpy(mixed_torus(), size=0.05)),
 }
 
@@ -37,15 +40,14 @@ def surface(request, monkeypatch):
 
 @pytest.mark.core
 def test_both_sides_of_a_crease_have_the_same_positions(float_type, rounding):
-    cage = tagged(named_cages.cube(), creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)])
-    table = LimitSurface(cage).sampling(4)
+    table = LimitSurface(CREASED).sampling(4)
     copies = np.flatnonzero(table.weld_target != np.arange(table.vertex_count))
     # Four vertices, and three samples inside each of four edges.
     assert len(copies) == 16
-    positions, normals = (vectors(v) for v in VertexKernel(table, float_type)(upload(float_type, cage.positions)))
+    positions, normals = (vectors(v) for v in VertexKernel(table, float_type)(upload(float_type, CREASED.positions)))
     assert np.array_equal(positions[copies], positions[table.weld_target[copies]])
     assert ((normals[copies] * normals[table.weld_target[copies]]).sum(axis=1) < 0.9).all()
-    assert np.abs(positions - table.apply(cage.positions)[0]).max() <= rounding
+    assert np.abs(positions - table.apply(CREASED.positions)[0]).max() <= rounding
 
 
 def vectors(flat):
@@ -95,9 +97,9 @@ def test_classes_share_kernels_which_do_not_depend_on_where_arrays_lie(surface, 
         kept.append([np.empty(40 * count, dtype=np.uint8), VertexKernel(table, float_type)])
         found.add(launched(kept[-1][1], points))
     (hashes,) = found
-    # One refines the control points, if any does, one packs them; one each for vertices on planes and on polynomials of
-    # the scheme.
-    assert len(hashes) == (table.refinement is not None) + 1 + len(table.polynomials)
+    # One packs the control points; one each for vertices on planes and on polynomials of the scheme. Others refine
+    # control points and weld copies of vertices, where there are any.
+    assert len(hashes) == 1 + len(table.polynomials) + (table.refinement is not None) + bool(table.copies.size)
 
 
 @pytest.mark.core

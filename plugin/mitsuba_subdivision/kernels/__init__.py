@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from ..deferred import deferred
 
 if TYPE_CHECKING:
-    from .vertex_kernel import EvaluatedVertices, VertexKernel
+    from .vertex_kernel import VertexKernel
 
-__all__ = ["EvaluatedVertices", "VertexKernel"]
+__all__ = ["VertexKernel"]
 
 __getattr__ = deferred(__name__, {"vertex_kernel": __all__})

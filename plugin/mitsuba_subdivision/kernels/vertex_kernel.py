@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -48,30 +47,41 @@ class VertexKernel:
         Normals have the direction of the cross product of the tangents, and are zero where a patch is folded or
         collapsed. Raises ValueError if the number of control points is not that of the table.
         """
-        return self.evaluated(dr.detach(control_points)).attached(control_points)
+        return self.attached(control_points, *self.evaluated(dr.detach(control_points)))
 
-    def evaluated(self, control_points: FloatBuffer) -> EvaluatedVertices:
-        """Evaluate all vertices from detached control points.
-
-        Raises ValueError if the number of control points is not that of the table.
-        """
+    def evaluated(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
+        """Points and unit normals from detached control points; raises as a call does."""
         if dr.width(control_points) != 3 * self.control_count:
             raise ValueError(coordinates_expected(dr.width(control_points), self.control_count))
         padded, buffers = self._padded(control_points), self._buffers()
         for part in self._parts:
             part.evaluate(padded, buffers)
-        positions, normals = buffers
-        return EvaluatedVertices(self, control_points, positions, normals, self.welded(positions))
+        return self._welded(*buffers)
+
+    def attached(
+        self, control_points: FloatBuffer, positions: FloatBuffer, normals: FloatBuffer
+    ) -> tuple[FloatBuffer, FloatBuffer]:
+        """Attach the results of `evaluated` to the control points, if these are differentiated.
+
+        Needed once for each gradient: Dr.Jit removes a computation from its graph once gradients have passed through.
+        """
+        derivatives = (partial(function, dr.detach(control_points)) for function in (self.changes, self.gradient))
+        vertices: tuple[FloatBuffer, FloatBuffer] = attached((positions, normals), control_points, *derivatives)
+        return vertices
 
     def changes(self, control_points: FloatBuffer, change: FloatBuffer) -> tuple[FloatBuffer, ...]:
         """Directional derivatives of points and normals for a change of the control points; flat, detached."""
         padded, padded_change, buffers = self._padded(control_points), self._padded(change), self._buffers()
         for part in self._parts:
             part.evaluate(padded, buffers, padded_change)
-        return buffers
+        return self._welded(*buffers)
 
     def gradient(self, control_points: FloatBuffer, positions: FloatBuffer, normals: FloatBuffer) -> FloatBuffer:
         """Gradient by the control points, from the gradients by points and normals; flat, detached."""
+        if self._weld_target is not None:
+            welded: Vector3 = dr.unravel(self._types.vector3, positions)
+            positions = dr.zeros(self._types.float, 3 * self.vertex_count)
+            dr.scatter_add(positions, welded, self._weld_target)
         dr.eval(positions, normals)
         padded = self._padded(control_points)
         sums: FloatBuffer = dr.zeros(self._types.float, PACKET * self._refined_count)
@@ -85,9 +95,11 @@ class VertexKernel:
         points = control_points if self._refinement is None else self._refinement.product(control_points)
         return self._types.padded(points)
 
-    def welded(self, positions: FloatBuffer) -> FloatBuffer:
-        """Positions that are bitwise equal on both sides of a crease, see `VertexTable.weld_target`."""
-        return positions if self._weld_target is None else self._types.gathered(positions, self._weld_target)
+    def _welded(self, positions: FloatBuffer, normals: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
+        """Make positions bitwise equal on both sides of a crease, see `VertexTable.weld_target`."""
+        if self._weld_target is not None:
+            positions = self._types.gathered(positions, self._weld_target)
+        return positions, normals
 
     def _buffers(self) -> tuple[FloatBuffer, FloatBuffer]:
         kind, size = self._types.float, 3 * self.vertex_count
@@ -188,32 +200,6 @@ class _Part:
         run, end = (dr.gather(types.index, self._first_run, lane + end) for end in (0, 1))
         _, *state = dr.while_loop((run, *start), lambda run, *_: run < end, add_run, label=label)
         return tuple(state)
-
-
-@dataclass(frozen=True, eq=False)
-class EvaluatedVertices:
-    """Evaluated vertices of a tessellation, which can be attached to their control points."""
-
-    kernel: VertexKernel
-    control_points: FloatBuffer  # Control points at evaluation, detached
-    # flat Dr.Jit float arrays, (3 vertex_count): points and unit normals; detached
-    positions: FloatBuffer
-    normals: FloatBuffer
-    welded: FloatBuffer  # Positions, see `VertexKernel.welded`
-
-    def attached(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        """Attach positions and normals to control points if these are differentiated, without evaluating again.
-
-        Needed once for each gradient: Dr.Jit removes a computation from its graph once gradients have passed through.
-
-        Returns positions, normals, flat Dr.Jit float arrays, (3 vertex_count).
-        """
-        if not dr.grad_enabled(control_points):
-            return self.welded, self.normals
-        kernel, values = self.kernel, (self.positions, self.normals)
-        derivatives = (partial(function, self.control_points) for function in (kernel.changes, kernel.gradient))
-        positions, normals = attached(values, control_points, *derivatives)
-        return kernel.welded(positions), normals
 
 
 def placed(

@@ -22,7 +22,7 @@ from .device_state import is_recording
 from .placement import Placement
 
 if TYPE_CHECKING:
-    from ..kernels import EvaluatedVertices, VertexKernel
+    from ..kernels import VertexKernel
     from ..kernels.surface_kernel import SurfaceKernel
     from ..tessellation import AttributeTable, VertexTable
     from .displaced_vertices import DisplacedVertices
@@ -81,7 +81,7 @@ class MeshBuffers:
         # Whether vertices are differentiable with respect to control points, placement and displacement.
         self.are_differentiable = self._kernel is not None and dr.is_diff_v(variant.Float)
         self._computed: set[int] = set()
-        self._evaluated: EvaluatedVertices | None = None
+        self._evaluated: tuple[FloatBuffer, FloatBuffer] | None = None
         # None if vertices are not shared, and after the first evaluation.
         self._loaded: LaterArrays | None = None
         if self._kernel is not None and table.vertex_count <= MOST_SHARED:
@@ -130,19 +130,19 @@ class MeshBuffers:
         if self._kernel is None:
             return self._placed(*self._on_host(points), points)
         evaluate = partial(self._kernel.evaluated, dr.detach(points))
-        evaluated: EvaluatedVertices = evaluate() if loaded is None else loaded.get(evaluate)
+        vertices: tuple[FloatBuffer, FloatBuffer] = evaluate() if loaded is None else loaded.get(evaluate)
         # Also kept for a displacement, as gradients of heights may be enabled later.
-        self._evaluated = evaluated if moves or self._displaced is not None else None
-        return self._placed(*evaluated.attached(points), points)
+        self._evaluated = vertices if moves or self._displaced is not None else None
+        return self._placed(*self._kernel.attached(points, *vertices), points)
 
     def attached(self, control_points: FloatBuffer) -> dict[str, FloatBuffer]:
         """Attach exact shading and the buffers of the last evaluation to the parameters again."""
         points, surface = self._placement.relative(control_points), self._surface
         if surface is not None and dr.grad_enabled(points):
             surface.values.attach(points)
-        if self._evaluated is None:
+        if self._kernel is None or self._evaluated is None:
             raise RuntimeError("vertices were not kept; expected an evaluation with derivatives before")
-        return self._placed(*self._evaluated.attached(points), points)
+        return self._placed(*self._kernel.attached(points, *self._evaluated), points)
 
     def warn_of_lost(
         self,
