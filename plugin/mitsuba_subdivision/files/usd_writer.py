@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +98,7 @@ def _new_mesh(
 
 
 def _set_primvars(mesh: UsdGeom.Mesh, texcoords: Attribute | None, attributes: dict[str, Attribute]) -> None:
-    from pxr import Sdf, UsdGeom
+    from pxr import Sdf, UsdGeom, Vt
 
     types = Sdf.ValueTypeNames
     by_width = {1: types.FloatArray, 2: types.Float2Array, 3: types.Float3Array, 4: types.Float4Array}
@@ -116,20 +116,14 @@ def _set_primvars(mesh: UsdGeom.Mesh, texcoords: Attribute | None, attributes: d
         if width not in by_width:
             primvar.SetElementSize(width)
         if attribute.indices is not None:
-            primvar.SetIndices(_integers(attribute.indices))
+            primvar.SetIndices(Vt.IntArray.FromNumpy(_integers(attribute.indices)))
 
 
-def _floats(values: NDArray) -> Any:
-    """USD array in single precision; of vectors if ``values`` has two to four columns."""
-    from pxr import Vt
-
+def _floats(values: NDArray) -> NDArray[np.float32]:
+    """Values in single precision; flat unless USD has vectors of as many numbers."""
     values = np.ascontiguousarray(values, dtype=np.float32)
-    width = values.shape[1] if values.ndim == 2 else 1
-    kind = {2: Vt.Vec2fArray, 3: Vt.Vec3fArray, 4: Vt.Vec4fArray}.get(width, Vt.FloatArray)
-    return kind.FromNumpy(values if kind is not Vt.FloatArray else values.ravel())
+    return values if values.ndim == 2 and values.shape[1] in (2, 3, 4) else values.ravel()
 
 
-def _integers(values: NDArray) -> Any:
-    from pxr import Vt
-
-    return Vt.IntArray.FromNumpy(np.ascontiguousarray(values, dtype=np.int32).ravel())
+def _integers(values: NDArray) -> NDArray[np.int32]:
+    return np.ascontiguousarray(values, dtype=np.int32).ravel()
