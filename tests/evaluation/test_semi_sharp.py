@@ -251,7 +251,7 @@ def test_lasting_features_have_the_limits_of_brute_force(scheme, method, np_rng)
     for corners in [[0, 0, 0], *descents]:
         face, mesh, uv = int(element), slow, np.zeros((1, 2))
         for corner in corners:
-            face, mesh = 4 * face + corner, mesh.refined()
+            face, mesh = face * int(sizes[0]) + corner, mesh.refined()
         for corner in corners[::-1]:
             uv = surface.scheme.domain.rotation(corner)(uv / 2)
         vertex = mesh.faces[face][0]

@@ -225,6 +225,7 @@ def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
         key = "vertex", vertex
         return (key, index) if (key, index) in values else add(key, index, _moved(around, vertex, index, scheme))
 
+    middles: list[list] = []
     for f, face in enumerate(c.faces):
         n = len(face)
         corners = [vertex_value(f, i) for i in range(n)]
@@ -236,8 +237,10 @@ def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
             faces.append(tuple(vertex for vertex, _ in ring))
             indices.append(tuple(index for _, index in ring))
         if centre is None:
-            faces.append(tuple(vertex for vertex, _ in edges))
-            indices.append(tuple(index for _, index in edges))
+            middles.append(edges)
+    # As the package, with the middle triangles of Loop's scheme after all others.
+    faces += [tuple(vertex for vertex, _ in middle) for middle in middles]
+    indices += [tuple(index for _, index in middle) for middle in middles]
     creases = {frozenset((("vertex", v), ("edge", edge))): around.left(edge, v) for edge in c.creases for v in edge}
     corners = {("vertex", vertex): less(sharpness) for vertex, sharpness in c.corners.items()}
     followed = {(("vertex", v), i): (("vertex", w), j) for (v, i), (w, j) in c.followed.items()}
