@@ -6,13 +6,12 @@ from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from patches.closed_cages import bumpy, cage_of, cube_with_hexagon
 from reference.refined_cages import refine_first, tagged
-
-RING = ((0, 1), (1, 3), (3, 2), (2, 0))
+from shapes.cages import RING
 
 
 def ring_of(sharpness):
     """A cube with a ring of creases around a face."""
-    return tagged(named_cages.cube(), creases=[(a, b, sharpness) for a, b in RING])
+    return tagged(named_cages.cube(), creases=[(a, b, sharpness) for a, b, _ in RING])
 
 
 CLOSED = {

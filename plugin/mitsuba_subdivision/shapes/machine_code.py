@@ -278,12 +278,12 @@ def _code_after(
 ) -> bytes:
     """Machine code of `calling_after`."""
     library = bindings()
-    set_state, destruct = _call(_address(library[_SET_STATE])), _call(_address(library[_DESTRUCT]))
+    set_state, destruct = _call(library[_SET_STATE]), _call(library[_DESTRUCT])
     on_error = [
         # After an exception, the object does not exist for C++: destruct it, without freeing its memory.
-        _move("rdi", id(kind)) + _MADE + _move("rdx", 0) + _call(_address(library[_OBJECT_AT])) + _KEEP_OBJECT,
+        _move("rdi", id(kind)) + _MADE + _move("rdx", 0) + _call(library[_OBJECT_AT]) + _KEEP_OBJECT,
         _KEPT[0] + _move("rsi", 1) + _move("rdx", 1) + set_state + _KEPT[0] + destruct,
-        _KEPT[0] + _move("rsi", 0) + _move("rdx", 0) + set_state + _KEPT[0] + _forget(),
+        _KEPT[0] + _move("rsi", 0) + _move("rdx", 0) + set_state + _KEPT[0] + _call(ctypes.pythonapi.Py_DecRef),
         _raise(),
     ]
     call_python = _ask(function) + _jump_if_equal(len(_answered() + _LEAVE)) + _answered()
@@ -300,16 +300,16 @@ def _ask(function: Callable[..., None]) -> bytes:
     library, python = bindings(), ctypes.pythonapi
     for number in _SIGNALS:
         _c_library().sigaddset(_SIGNAL_SET, int(number))
-    block = _BLOCK + _move("rsi", ctypes.addressof(_SIGNAL_SET)) + _call(_address(library["pthread_sigmask"]))
-    enter = _call(_address(python.PyGILState_Ensure)) + _STATE_OF_RESULT
-    arguments = _move("rdi", id(function)) + _move("rsi", _address(_NUMBERS)) + _FIRST_FOUR
-    call = _PUSH_SEVENTH + _PUSH_FIFTH_AND_SIXTH + _NO_VECTORS + _call(_address(python.PyObject_CallFunction)) + _DROP_4
+    block = _BLOCK + _move("rsi", ctypes.addressof(_SIGNAL_SET)) + _call(library["pthread_sigmask"])
+    enter = _call(python.PyGILState_Ensure) + _STATE_OF_RESULT
+    arguments = _move("rdi", id(function)) + _move("rsi", _NUMBERS) + _FIRST_FOUR
+    call = _PUSH_SEVENTH + _PUSH_FIFTH_AND_SIXTH + _NO_VECTORS + _call(python.PyObject_CallFunction) + _DROP_4
     return block + enter + arguments + call + _IS_NULL
 
 
 def _answered() -> bytes:
     """Release the result of Python and the interpreter."""
-    return _RESULT + _forget() + _release()
+    return _RESULT + _call(ctypes.pythonapi.Py_DecRef) + _release()
 
 
 def _raise() -> bytes:
@@ -317,27 +317,23 @@ def _raise() -> bytes:
     library, python = bindings(), ctypes.pythonapi
     return b"".join(
         [
-            _RAISED + _call(_address(python.PyErr_Fetch)) + _RAISED + _call(_address(python.PyErr_NormalizeException)),
-            _move("rdi", id(_fail)) + _move("rsi", _address(_FAILURE)) + _FAILED + _NO_VECTORS,
-            _call(_address(python.PyObject_CallFunction)),
-            *[kept + _forget() for kept in _KEPT],
-            _move("rdi", _ERROR_SIZE) + _call(_address(library["__cxa_allocate_exception"])),
-            _KEEP_ERROR + _call(_address(library[_ERROR])),
+            _RAISED + _call(python.PyErr_Fetch) + _RAISED + _call(python.PyErr_NormalizeException),
+            _move("rdi", id(_fail)) + _move("rsi", _FAILURE) + _FAILED + _NO_VECTORS,
+            _call(python.PyObject_CallFunction),
+            *[kept + _call(ctypes.pythonapi.Py_DecRef) for kept in _KEPT],
+            _move("rdi", _ERROR_SIZE) + _call(library["__cxa_allocate_exception"]),
+            _KEEP_ERROR + _call(library[_ERROR]),
             _release(),
-            _KEPT_ERROR + _move("rsi", _address(library[_ERROR_TYPE])) + _move("rdx", _address(library[_NO_ERROR])),
-            _call(_address(library["__cxa_throw"])) + _NEVER,
+            _KEPT_ERROR + _move("rsi", library[_ERROR_TYPE]) + _move("rdx", library[_NO_ERROR]),
+            _call(library["__cxa_throw"]) + _NEVER,
         ]
     )
 
 
-def _forget() -> bytes:
-    return _call(_address(ctypes.pythonapi.Py_DecRef))
-
-
 def _release() -> bytes:
     """Release the interpreter and unblock signals."""
-    release = _STATE + _call(_address(ctypes.pythonapi.PyGILState_Release))
-    return release + _UNBLOCK + _call(_address(bindings()["pthread_sigmask"]))
+    release = _STATE + _call(ctypes.pythonapi.PyGILState_Release)
+    return release + _UNBLOCK + _call(bindings()["pthread_sigmask"])
 
 
 def _frame_description(address: int, size: int) -> bytes:
@@ -347,17 +343,14 @@ def _frame_description(address: int, size: int) -> bytes:
     return common + struct.pack("<I", len(description)) + description + bytes(4)
 
 
-def _address(function: Any) -> int:
-    return ctypes.cast(function, ctypes.c_void_p).value or 0
-
-
-def _move(register: str, value: int) -> bytes:
-    """``mov register, value``."""
+def _move(register: str, value: Any) -> bytes:
+    """``mov register, value``: a number, or the address of an object of ctypes."""
+    number = value if isinstance(value, int) else ctypes.cast(value, ctypes.c_void_p).value or 0
     opcodes = {"rdi": "48bf", "rsi": "48be", "rdx": "48ba", "r11": "49bb"}
-    return bytes.fromhex(opcodes[register]) + struct.pack("<Q", value)
+    return bytes.fromhex(opcodes[register]) + struct.pack("<Q", number)
 
 
-def _call(function: int) -> bytes:
+def _call(function: Any) -> bytes:
     """``mov r11, function; call r11``."""
     return _move("r11", function) + bytes.fromhex("41ffd3")
 
