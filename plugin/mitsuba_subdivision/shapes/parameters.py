@@ -15,21 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage import ControlCage
-from ..cage.contents import RULES, Attribute, Interpolation
+from ..cage.contents import INTERPOLATIONS, RULES, Attribute, Interpolation
 from ..cage.errors import CageSource, noting_warnings, warn, without_warnings
 
 # Needed at run time: Dr.Jit resolves the annotations of dataclasses that a shape refers to.
 from ..evaluation.equations import Evaluator
 from ..files.formats import FORMATS
 from ..mesh.shared import Shared
-from ..surface import LimitSurface
+from ..surface import TEXCOORDS, LimitSurface
 from .cage_attributes import RESERVED
 from .parameter_table import PARAMETER_OF_NAME, errors_about, value_of
 from .placement import checked_matrix
 from .tessellation_parameters import Tessellation, read_tessellation
 
-TEXCOORDS, TEXCOORD_INDICES = "texcoords", "texcoord_indices"
-INTERPOLATIONS: tuple[Interpolation, ...] = ("vertex", "varying", "face_varying")
+TEXCOORD_INDICES = "texcoord_indices"
 # Parameters of a cage in memory, and their shapes, with -1 for any size.
 ARRAYS = {"positions": (-1, 3), "face_sizes": (-1,), "face_vertices": (-1,)}
 TAGS = {"creases": (-1, 3), "corners": (-1, 2), "holes": (-1,)}
