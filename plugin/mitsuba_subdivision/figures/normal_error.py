@@ -120,7 +120,11 @@ def exact_normals(cage: ControlCage) -> NDArray[np.float64]:
             tangents.append(_rows_to(0, _rows_to(0, basis) * children[child]))
         normals = []
         for _ in LEVELS:
-            normals += [_unit_normal(rows * points, mpmath) for rows in tangents]
+            for rows in tangents:
+                (a, b, c), (d, e, f) = (rows * points).tolist()
+                normal = b * f - c * e, c * d - a * f, a * e - b * d
+                length = mpmath.sqrt(sum(x * x for x in normal))
+                normals.append([float(x / length) for x in normal])
             points = matrix * points
     return np.array(normals, dtype=np.float64)
 
@@ -130,10 +134,3 @@ def _rows_to(total: int, matrix: Any) -> Any:
     for i in range(matrix.rows):
         matrix[i, 0] += total - sum(matrix[i, :])
     return matrix
-
-
-def _unit_normal(tangents: Any, mpmath: Any) -> list[float]:
-    (a, b, c), (d, e, f) = tangents.tolist()
-    normal = [b * f - c * e, c * d - a * f, a * e - b * d]
-    length = mpmath.sqrt(sum(x * x for x in normal))
-    return [float(x / length) for x in normal]

@@ -78,11 +78,10 @@ def studio(
     bounds: ArrayLike,  # (2, 3): least and greatest coordinates of the model, in the world
     *,
     up: str = "z",  # Axis of the world that points up: "z" or "y"
-    # "front", "side", "back", "top", "three-quarter", or azimuth and elevation in degrees. Azimuth 0 is the front,
-    # which is -y where z is up, and +z where y is up; azimuth 90 is +x; elevation 90 is straight from above.
+    # As for `studio_scene`
     view: View = DEFAULT_VIEW,
-    size: tuple[int, int] = DEFAULT_SIZE,  # (width, height): of the film, in pixels
-    spp: int = DEFAULT_SPP,  # Samples per pixel
+    size: tuple[int, int] = DEFAULT_SIZE,
+    spp: int = DEFAULT_SPP,
     # (n, 3): of the model in the world, within the bounds. The camera frames these; by default, the box.
     points: ArrayLike | None = None,
     name: str | None = None,  # Of the model, or of its file, with which messages begin
@@ -91,10 +90,9 @@ def studio(
 
     A variant of Mitsuba must be set. The studio is sized for the model, and its lights turn with the camera. Where the
     camera is below the model's middle there is no floor, and lights come from below.
-    Returns dict: "integrator", "sensor", "key_light", "fill_light", "rim_light", "ambient_light" and "ground". "ground"
-    is missing in views from below. Raises ValueError if no variant is set; if bounds are not finite, or the least not
-    below the greatest; if view, axis, size or samples are invalid. Warns if the model is so small or large that
-    Mitsuba's single precision does not render it.
+    Returns "integrator", "sensor", "key_light", "fill_light", "rim_light", "ambient_light" and, in views from above,
+    "ground". Raises ValueError if no variant is set, or an argument is invalid. Warns if the model is so small or large
+    that Mitsuba's single precision does not render it.
     """
     variant_in_use()
     prefix = "" if name is None else f"{name}: "
