@@ -7,7 +7,7 @@ import io
 import json
 import os
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -220,14 +220,18 @@ def _estimate(
     return Estimate(pixels, variance, count, batches)
 
 
+def _has_all(channels: Channels, names: Sequence[str], source: str, what: str) -> bool:
+    """Whether a file has all channels of some names, or none of them. Raises RegressionError if it lacks some."""
+    missing = [name for name in names if name not in channels]
+    if missing and len(missing) < len(names):
+        raise RegressionError(f'image "{source}" has {what} {", ".join(missing)}; expected {", ".join(names)}')
+    return not missing
+
+
 def _probe(channels: Channels, source: str) -> Probe | None:
     expected = [channel for names in _PROBE.values() for channel in names]
-    missing = [channel for channel in expected if channel not in channels]
-    if missing == expected:
+    if not _has_all(channels, expected, source, "a geometry probe without"):
         return None
-    if missing:
-        lacking = f"without {', '.join(missing)}; expected {', '.join(expected)}"
-        raise RegressionError(f'image "{source}" has a geometry probe {lacking}')
     fields = {name: np.stack([channels[channel] for channel in names], axis=-1) for name, names in _PROBE.items()}
     return Probe(**{name: values[..., 0] if values.shape[2] == 1 else values for name, values in fields.items()})
 
@@ -238,11 +242,8 @@ def _rgb_channels(prefix: str, values: NDArray[np.floating]) -> Channels:
 
 def _rgb(channels: Channels, prefix: str, source: str) -> NDArray[np.float64] | None:
     names = [f"{prefix}{name}" for name in _RGB]
-    missing = [name for name in names if name not in channels]
-    if len(missing) == len(names):
+    if not _has_all(channels, names, source, "no channel"):
         return None
-    if missing:
-        raise RegressionError(f'image "{source}" has no channel {", ".join(missing)}; expected {", ".join(names)}')
     return np.stack([channels[name] for name in names], axis=-1).astype(np.float64)
 
 
