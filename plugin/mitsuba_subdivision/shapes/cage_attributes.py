@@ -84,12 +84,11 @@ class CageAttributes:
             f"{PREFIX}{name}": flat_type(shared.array) for name, shared in self._given.items()
         }
         self.moving: set[str] = set()  # Names of the parameters that move vertices
-        self._colors = {
-            name
+        self._upsampling = {
+            name: SpectralUpsampling.shared(variant)
             for name, channel in self._channels.items()
             if holds_spectra(variant, mesh_name(name), channel.values.shape[1])
         }
-        self._upsampling = SpectralUpsampling.shared(variant) if self._colors else None
         # Functions that take each new array of an attribute's values.
         self._followers: dict[str, list[Callable[[FloatBuffer], None]]] = {}
         # Updated values of attributes, as watched for reverse-mode passes.
@@ -155,7 +154,7 @@ class CageAttributes:
 
     def _stored(self, name: str) -> FloatBuffer:
         values = self._at_vertices(name)
-        return self._upsampling.stored(values) if self._upsampling and name in self._colors else values
+        return self._upsampling[name].stored(values) if name in self._upsampling else values
 
     def _at_vertices(self, name: str) -> FloatBuffer:
         if name not in self._moved:

@@ -82,10 +82,11 @@ class ExactShading:
             for name, attribute in surface.cage.attributes.items()
             if attribute.values.shape[1] in WIDTHS
         }
-        self._colors = {
-            name for name, channel in self._attributes.items() if holds_spectra(variant, name, channel.values.size)
+        self._upsampling = {
+            name: SpectralUpsampling.shared(variant)
+            for name, channel in self._attributes.items()
+            if holds_spectra(variant, name, channel.values.size)
         }
-        self._upsampling = SpectralUpsampling.shared(variant) if self._colors else None
         self._shape: Callable[[], mi.Mesh | None] = lambda: None
         self._sign = 1.0
 
@@ -253,7 +254,7 @@ class ExactShading:
             lines = Lines(o, d, kind == ON_LINE)
             location = self.kernel.at(location, active, constraint=lines).location
         value = self._attributes[name](location, active)[0]
-        return self._upsampling(value) if self._upsampling and name in self._colors else value
+        return self._upsampling[name](value) if name in self._upsampling else value
 
     def texcoords_of_corners(self, face_count: int) -> FloatArray:
         """Texture coordinates ``(3 n, 2)`` at the corners of all triangles, in their order in the mesh."""
