@@ -103,20 +103,15 @@ def _print(text: object, stream: TextIO | None) -> None:
         return
     try:
         if text is not None:
-            _wipe()
+            if _is_terminal():
+                # A message takes the place of the line of progress.
+                print("\r\x1b[K", end="", file=sys.stderr, flush=True)
             print(text, file=stream)
         stream.flush()
     except BrokenPipeError:
         # Otherwise Python tries once more when it ends.
         with suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-
-
-def _wipe() -> None:
-    """Clear the line of the terminal, if there is one, for a message in its place."""
-    if _is_terminal():
-        sys.stderr.write("\r\x1b[K")
-        sys.stderr.flush()
 
 
 def _is_terminal() -> bool:

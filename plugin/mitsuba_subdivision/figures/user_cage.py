@@ -39,7 +39,13 @@ def around_vertices(
             fans = _isolated_fans(cage)
     if not fans:
         raise FigureError(f'"{path}" has no extraordinary vertex inside of its surface and apart from creases')
-    return {valence: _aligned(_numbered(cage, fans[valence]), like) for valence in sorted(fans)[:most]}
+    cages, (to, to_axes, to_length) = {}, like
+    for valence in sorted(fans)[:most]:
+        numbered = _numbered(cage, fans[valence])
+        point, axes, length = frame(LimitSurface(numbered))
+        moved = (numbered.positions - point) @ axes @ to_axes.T * (to_length / length) + to
+        cages[valence] = numbered.with_positions(moved)
+    return cages
 
 
 def read(path: Path) -> ControlCage:
@@ -109,9 +115,3 @@ def _numbered(cage: ControlCage, fan: NDArray[np.integer]) -> ControlCage:
     creases[:, :2], corners[:, 0] = number[creases[:, :2].astype(int)], number[corners[:, 0].astype(int)]
     options: dict[str, Any] = {**contents.rules, "creases": creases, "corners": corners, "holes": holes}
     return ControlCage(positions, faces, **options)
-
-
-def _aligned(cage: ControlCage, like: tuple[NDArray[np.float64], ...]) -> ControlCage:
-    point, axes, length = frame(LimitSurface(cage))
-    to, to_axes, to_length = like
-    return cage.with_positions((cage.positions - point) @ axes @ to_axes.T * (to_length / length) + to)
