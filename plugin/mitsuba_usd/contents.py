@@ -20,12 +20,13 @@ class TextureContents:
     file: str  # Path; `a.usdz[b.png]` for a file in an archive
     channel: str  # "rgb", "r", "g", "b" or "a"; within a `NodeContents` also "rg" and "rgba"
     color_space: str  # "auto", "raw" or "sRGB"
-    wrap: str  # Mitsuba's name: "repeat", "clamp" or "mirror"
-    scale: list[float]
-    bias: list[float]
-    to_uv: NDArray  # (3, 3) float64: from texture coordinates to those of the picture, whose v points up
-    texcoords: str  # Name of the primvar that has the texture coordinates
-    fallback: list[float]  # Four numbers, where there is no such file
+    wrap: str = "repeat"  # Mitsuba's name: "repeat", "clamp" or "mirror"
+    scale: list[float] = field(default_factory=lambda: [1.0] * 4)
+    bias: list[float] = field(default_factory=lambda: [0.0] * 4)
+    # (3, 3) float64: from texture coordinates to those of the picture, whose v points up
+    to_uv: NDArray = field(default_factory=lambda: np.eye(3))
+    texcoords: str = "st"  # Name of the primvar that has the texture coordinates
+    fallback: list[float] = field(default_factory=lambda: [0.0] * 4)  # Where there is no such file
 
     @property
     def channels(self) -> list[int]:

@@ -126,8 +126,7 @@ class NetworkReader:
         given = UsdShade.Shader(attribute.GetPrim()).GetInput(_COLOR_SPACE)
         named = value_at(given.GetAttr(), self._time) if given else None
         space = "sRGB" if self._is_srgb(attribute.GetColorSpace(), attribute.GetPath()) else "raw"
-        space = named if named in ("auto", "raw", "sRGB") else space
-        return TextureContents(path, "rgba", space, "repeat", [1.0] * 4, [0.0] * 4, np.eye(3), "st", [0.0] * 4)
+        return TextureContents(path, "rgba", named if named in ("auto", "raw", "sRGB") else space)
 
     def _is_srgb(self, space: str, prim: object) -> bool:
         if space not in _IS_SRGB:

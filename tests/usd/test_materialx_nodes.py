@@ -12,9 +12,8 @@ from mitsuba_usd.textures import _procedural_wrap, baked
 UV = NodeContents("texcoord", "vector2", {"name": "st"})
 
 
-def picture(channel="rgb", name="a.png", to_uv=None, wrap="repeat"):
-    matrix = np.eye(3) if to_uv is None else np.asarray(to_uv, dtype=float)
-    return TextureContents(name, channel, "raw", wrap, [1.0] * 4, [0.0] * 4, matrix, "st", [0.0] * 4)
+def picture(channel="rgb", name="a.png", to_uv=((1, 0, 0), (0, 1, 0), (0, 0, 1))):
+    return TextureContents(name, channel, "raw", to_uv=np.asarray(to_uv, dtype=float))
 
 
 GREY = [0.2, 0.5, 0.7]

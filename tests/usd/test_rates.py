@@ -15,12 +15,12 @@ from mitsuba_subdivision.mitsuba_mesh import points_at
 from mitsuba_subdivision.studio.model import frame_table
 from mitsuba_subdivision.studio.picture import ERRORS, FINEST_RATE, MOST_TRIANGLES, highest_rate, outline_for
 from mitsuba_usd import copies
-from mitsuba_usd.contents import InstanceContents, ShapeContents
+from mitsuba_usd.contents import InstanceContents, SceneContents, ShapeContents
 from mitsuba_usd.copies import LARGE, LEAST_INSTANCES, with_copies, with_large_copies
 from mitsuba_usd.picture_detail import segments_of, triangles_for_picture
 from mitsuba_usd.shapes import DENSE, Surfaces, subdivision
 from mitsuba_usd.stage_warnings import StageWarnings
-from usd.contents_of_scenes import FOV, WIDTH, scene_of, sensor_at
+from usd.sensors import FOV, WIDTH, sensor_at
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 
@@ -35,7 +35,7 @@ def _segments(contents, sensor, shading):
 
 
 def _rate(shape, sensor, shading="exact"):
-    return _segments(scene_of(shape), sensor, shading)[shape]
+    return _segments(SceneContents(shapes=[shape]), sensor, shading)[shape]
 
 
 def _triangles(contents, sensor, shading="exact", **parameters):
@@ -91,7 +91,7 @@ def test_the_nearest_instance_decides():
     places = [InstanceContents(f"/{z}", 0, _moved(0, 0, z)) for z in (0, 40, 400)]
 
     def rate(instances):
-        return _segments(scene_of(groups=[[shape]], instances=instances), sensor_at(8), "exact")[shape]
+        return _segments(SceneContents(groups=[[shape]], instances=instances), sensor_at(8), "exact")[shape]
 
     assert rate(places) == rate(places[:1]) == _rate(shape, sensor_at(8)) > rate(places[1:]) > rate(places[2:])
 
@@ -99,7 +99,7 @@ def test_the_nearest_instance_decides():
 def test_still_pictures_have_adaptive_triangles_where_these_are_fewer():
     cage, sensor = named_cages.torus(24, 16), sensor_at(5.0)
     shape, group, dense = _shape(cage), _shape(cage, name="/group"), _shape(named_cages.torus(300, 200))
-    contents = scene_of(shape, dense, groups=[[group]], instances=[InstanceContents("/i", 0, np.eye(4))])
+    contents = SceneContents(shapes=[shape, dense], groups=[[group]], instances=[InstanceContents("/i", 0, np.eye(4))])
     segments = _segments(contents, sensor, "exact")
     triangles = _triangles(contents, sensor)
     expected = {**outline_for(sensor), "max_rate": FINEST_RATE}
@@ -135,7 +135,7 @@ def test_dense_cages_are_framed_by_points_around_the_surface():
     contents = replace(cage.contents, positions=points, holes=np.arange(40), scheme="catmull_clark")
     with pytest.warns(CageWarning, match="used by no face"):
         surface = msub.LimitSurface(msub.ControlCage.from_arrays(**contents.as_arguments()))
-    points = Surfaces().points(scene_of(ShapeContents("/shape", contents, _moved(1, 2, 3))))
+    points = Surfaces().points(SceneContents(shapes=[ShapeContents("/shape", contents, _moved(1, 2, 3))]))
     exact = points_at(frame_table(surface).apply(surface.cage.positions)[0], _moved(1, 2, 3))
     for direction in np.random.default_rng(0).normal(size=(50, 3)):
         unit = direction / np.linalg.norm(direction)
@@ -182,7 +182,7 @@ def placed(number):
 
 def scene(shapes=(), group=(), count=COUNT):
     instances = [InstanceContents(f"/i{number}", 0, placed(number)) for number in range(count)]
-    return scene_of(*shapes, groups=[[*group]], instances=instances)
+    return SceneContents(shapes=[*shapes], groups=[[*group]], instances=instances)
 
 
 def rates_of(shape):

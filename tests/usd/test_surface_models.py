@@ -108,7 +108,7 @@ def test_metals_below_a_coat_reflect_their_colour_whatever_the_specular_weight()
 
 def test_roughness_beyond_1_is_1():
     """Networks of nodes divide by masks, and a roughness of 80,000 shines like a lamp."""
-    mask = TextureContents("none.png", "r", "raw", "repeat", [1] * 4, [0] * 4, np.eye(3), "st", [0.00001] * 4)
+    mask = TextureContents("none.png", "r", "raw", fallback=[0.00001] * 4)
     for beyond in (5.0, node("divide", "float", in1=0.8, in2=mask)):
         of_1, of_more = (both("standard_surface", 30, base_color=COLOR, specular_roughness=r) for r in (1.0, beyond))
         np.testing.assert_allclose(of_more, of_1, rtol=SAMPLED)

@@ -8,12 +8,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mitsuba_subdivision.cage.contents import Attribute, CageContents
-from mitsuba_usd.contents import InstanceContents, MaterialContents, NodeContents, ShapeContents, TextureContents
+from mitsuba_usd.contents import (
+    InstanceContents,
+    MaterialContents,
+    NodeContents,
+    SceneContents,
+    ShapeContents,
+    TextureContents,
+)
 from mitsuba_usd.picture_detail import TEXELS_PER_PIXEL, texels_for_pictures
 from mitsuba_usd.stage_warnings import StageWarnings
 from mitsuba_usd.texture_image import read_texture_image, reduced
 from mitsuba_usd.textures import Textures
-from usd.contents_of_scenes import FOV, WIDTH, scene_of, sensor_at
+from usd.sensors import FOV, WIDTH, sensor_at
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 
@@ -27,8 +34,7 @@ JPEG_LEVELS = 4
 
 
 def texture(file="a.png", **changes):
-    usual = TextureContents(file, "rgb", "sRGB", "repeat", [1] * 4, [0] * 4, np.eye(3), "st", [0, 0, 0, 1])
-    return replace(usual, **changes)
+    return TextureContents(file, **{"channel": "rgb", "color_space": "sRGB", **changes})
 
 
 def square(side=1.0, uv_side=1.0, to_world=None, *, has_texcoords=True):
@@ -39,7 +45,7 @@ def square(side=1.0, uv_side=1.0, to_world=None, *, has_texcoords=True):
 
 
 def needed_for(*shapes, inputs, **more):
-    contents = scene_of(*shapes, materials=[MaterialContents("/m", inputs)], **more)
+    contents = SceneContents(shapes=[*shapes], materials=[MaterialContents("/m", inputs)], **more)
     return texels_for_pictures(contents, [sensor_at(DISTANCE)])
 
 

@@ -1,13 +1,8 @@
-"""Small scenes as the reader of stages gives them, and a camera that looks at them."""
+"""A camera that looks at small scenes."""
 
 import mitsuba as mi
-from mitsuba_usd.contents import SceneContents
 
 WIDTH, FOV = 640, 30.0
-
-
-def scene_of(*shapes, groups=(), instances=(), materials=()):
-    return SceneContents("z", [*shapes], [*groups], [*instances], [*materials], [], None, None)
 
 
 def sensor_at(distance, width=WIDTH):
