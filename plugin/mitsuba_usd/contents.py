@@ -148,7 +148,7 @@ class LightContents:
     # softness of its cone.
     size: list[float] = field(default_factory=list)
     texture: str | None = None  # Path of a picture that multiplies the radiance
-    pole: str = "y"  # Pole axis of a dome's image: "y", "z", or "scene" for the stage's up axis
+    pole: str = "y"  # Axis of a dome's image
 
     @property
     def is_usable(self) -> bool:

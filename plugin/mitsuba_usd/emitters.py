@@ -22,12 +22,10 @@ _TURNED = np.diag([-1.0, 1, -1, 1])
 _LEAST_SOFTNESS = 1e-3
 
 
-def emitter(light: LightContents, up: str, textures: Textures) -> SceneNode:
-    """An emitter, or a shape with one; ``up`` is the up axis of the stage."""
-    if light.kind == "dome":
-        return _dome(light, up, textures)
-    if light.kind == "rect":
-        return _rect(light, textures)
+def emitter(light: LightContents, textures: Textures) -> SceneNode:
+    """An emitter, or a shape with one."""
+    if light.kind in ("dome", "rect"):
+        return _dome(light, textures) if light.kind == "dome" else _rect(light, textures)
     return _MAKERS[light.kind](light)
 
 
@@ -92,14 +90,14 @@ def _cylinder(light: LightContents) -> SceneNode:
     return {"type": "cylinder", "p0": start.tolist(), "p1": end.tolist(), "radius": radius, "emitter": area}
 
 
-def _dome(light: LightContents, up: str, textures: Textures) -> SceneNode:
+def _dome(light: LightContents, textures: Textures) -> SceneNode:
     radiance = np.array(light.emission)
     bitmap = None if light.texture is None else textures.radiance(light.texture, radiance)
     if bitmap is None:
         return {"type": "constant", "radiance": rgb(radiance)}
     turned = light.to_world.copy()
     turned[:3, 3] = 0
-    if light.pole == "z" or (light.pole == "scene" and up == "z"):
+    if light.pole == "z":
         turned = turned @ _POLE_TO_Z
     return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(turned.tolist())}
 

@@ -102,7 +102,7 @@ def scene_entries(
             group_of = {"type": "ref", "id": groups[instance.group]}
             add(instance.name, {"type": "instance", "group": group_of, "to_world": place})
     for light in one_environment(contents.lights, notes):
-        entry = emitter(light, contents.up, textures)
+        entry = emitter(light, textures)
         is_clear = has_clear_lamps and "emitter" in entry
         add(light.name, {**entry, "bsdf": {"type": "null"}} if is_clear else entry)
     return scene

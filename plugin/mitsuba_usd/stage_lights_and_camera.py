@@ -79,6 +79,9 @@ def read_light(
         kind = "spot"
     elif is_point:
         kind = "point"
+    pole = _value(prim, "poleAxis", time, "scene") if given == "DomeLight_1" else "Y"
+    if pole == "scene":
+        pole = UsdGeom.GetStageUpAxis(prim.GetStage())
     return LightContents(
         str(path),
         kind,
@@ -87,7 +90,7 @@ def read_light(
         bool(_value(prim, "inputs:normalize", time, False)),
         size,
         _texture(prim, time, notes) if kind in ("rect", "dome") else None,
-        str(_value(prim, "poleAxis", time, "scene")).lower() if given == "DomeLight_1" else "y",
+        str(pole).lower(),
     )
 
 

@@ -105,8 +105,9 @@ class StageScenes:
 
     def _read(self, number: int | None, delay: float = 0.0) -> SceneContents:
         """Contents of a frame, or of a sub-frame so many time codes later."""
-        path = self._path if self._files is None or number is None else self._files.file(number)
-        time = self._time if self._files is None or number is None else self._files.time(number)
+        path, time = self._path, self._time
+        if self._files is not None and number is not None:
+            path, time = self._files.file(number), self._files.time(number)
         if self._reader is None or (self._files is not None and self._files.are_many):
             require_usd(f'"{path}"')
             from .stage_walk import StageReader
