@@ -22,7 +22,7 @@ from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.ragged import chunks_of
 from ..patches import PatchTable
 from ..schemes.domain import FloatArray, ParameterDomain
-from .stitching import SideSamples, inner_counts, inner_steps, stitched
+from .stitching import inner_counts, inner_steps, stitched
 from .uniform_grid import first_sides
 
 # Greatest depth of tiles around extraordinary points: single precision does not resolve smaller ones.
@@ -213,19 +213,20 @@ class AdaptiveGrid:
     # (n,) int32: position of each sample on the line of its side, without that at which the side ends
     position: IndexArray
     topology: Topology  # Of the elements. Samples on the same edges and vertices of it are one vertex.
-    keeps_corner: NDArray[np.bool_] | None  # (t, m) bool or None: as for `stitched`
+    keeps_corner: NDArray[np.bool_]  # (t, m): as for `stitched`
 
     @classmethod
     def of(cls, tiles: Tiles, frames: PatchFrames) -> AdaptiveGrid:
         """The grid of tiles. Tiles of two elements that meet more than once get more segments."""
-        t, m, keeps_corner = frames.topology, frames.domain.corner_count, None
+        t, m = frames.topology, frames.domain.corner_count
+        keeps_corner = np.zeros((len(tiles), m), dtype=bool)
         needs_inner = (tiles["depth"] == 0) & _meets_twice(frames)[t.face[tiles["corner"]]]
         is_valence_two = (t.vertex_face_count > 0) & (t.vertex_face_count <= 2) & ~t.is_border_vertex
         if is_valence_two.any():
             # At vertices of valence 2, no triangle cuts off the corner of a tile: two tiles meet along both sides, and
             # both would have the same triangle.
             half_edge = sides_of(tiles, frames, int(tiles["depth"].max(initial=0))).at_vertices(m)
-            keeps_corner = (half_edge >= 0) & is_valence_two[t.face_vertices[half_edge]]
+            keeps_corner |= (half_edge >= 0) & is_valence_two[t.face_vertices[half_edge]]
             needs_inner |= keeps_corner.any(axis=1)
         if needs_inner.any():
             # With inner samples, the only inner edges that join two points of the sides cut off a corner.
@@ -321,9 +322,8 @@ class AdaptiveGrid:
         triangles = np.empty((int(begin[-1]), 3), dtype=np.int32)
         for block in chunks_of(len(self.tiles), self.side_counts.shape[1]):
             samples = slice(on_sides[block.start], on_sides[block.stop])
-            keeps_corner = None if self.keeps_corner is None else self.keeps_corner[block]
             rates, counts = self.tiles["rates"][block], self.side_counts[block]
-            of_block = stitched(rates, SideSamples(counts, self._along(samples)), keeps_corner)
+            of_block = stitched(rates, counts, self._along(samples), self.keeps_corner[block])
             count = samples.stop - samples.start
             first_inner = len(self.position) - count + inside[block.start]
             of_block += np.where(of_block >= count, first_inner, samples.start).astype(np.int32)

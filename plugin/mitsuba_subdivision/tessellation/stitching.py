@@ -71,24 +71,22 @@ def _inner_sample(rates: IntArray, u: IntArray, v: IntArray, corner_count: int) 
 
 def stitched(
     rates: IntArray,  # (t, 2) int64
-    sides: SideSamples,
-    # (t, m) bool: corners of tiles with inner samples that no triangle may cut off
-    keeps_corner: NDArray[np.bool_] | None = None,
+    side_counts: IntArray,  # (t, m) segments on each side
+    along: FloatArray,  # (n,) float64: as for `SideSamples`
+    keeps_corner: NDArray[np.bool_],  # (t, m): corners of tiles with inner samples that no triangle may cut off
 ) -> IndexArray:
     """Join the samples of tiles by triangles.
 
     Returns the samples of each triangle, (n, 3) int32, tile by tile. Samples on the sides of all tiles are numbered
     first, then inner samples.
     """
-    m = sides.counts.shape[1]
+    sides, m = SideSamples(side_counts, along), side_counts.shape[1]
     counts = inner_counts(rates, m)
-    first_inner = len(sides.along) + ragged.starts(counts)
+    first_inner = len(along) + ragged.starts(counts)
     parts, tiles = _across(rates, sides, np.flatnonzero(counts == 0)), np.flatnonzero(counts)
     if len(tiles):
-        is_cut = np.zeros(sides.counts.shape, dtype=bool)
-        if m == 3:
-            # A triangle's corner is further from the first inner sample than the spacing of the grid.
-            is_cut[tiles] = True if keeps_corner is None else ~keeps_corner[tiles]
+        # A triangle's corner is further from the first inner sample than the spacing of the grid.
+        is_cut = ~keeps_corner & (m == 3) & (counts > 0)[:, None]
         parts += _around_inner(rates, sides, tiles, first_inner, is_cut) + _inside(rates, first_inner, m)
     triangles, tile = (np.concatenate(column, dtype=np.int32) for column in zip(*parts, strict=True))
     return triangles.take(np.argsort(tile, kind="stable"), axis=0)
