@@ -59,17 +59,14 @@ class PatchFrames:
         t, is_split = patches.elements, patches.refined is not None
         is_whole = patches.is_whole & (not is_split)
         scale = np.where(patches.is_whole & is_split, 0.5, 1.0)
-        half_edge = np.arange(t.half_edge_count, dtype=np.int32)
-        edge = np.where(t.twin < 0, half_edge, np.minimum(half_edge, t.twin))
-        is_backward = edge != half_edge
-        start, border, has_copies = t.face_vertices, np.flatnonzero(t.twin < 0), False
+        edge = t.edge_half_edge[t.edge]
+        is_backward = edge != np.arange(t.half_edge_count)
+        start, border = t.face_vertices, np.flatnonzero(t.twin < 0)
         if patches.scheme.element == "face":
-            has_copies = not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex)))
-            if has_copies:
-                start = control_of_vertex.astype(np.int32)[start]
+            start = control_of_vertex.astype(np.int32)[start]
             edge[border] = first_sides(t, border, start)
             is_backward[border] = start[border] != start[edge[border]]
-            has_copies |= bool((edge[border] != border).any())
+        has_copies = bool((start != t.face_vertices).any() or (edge[border] != border).any())
         return cls(t, patches.scheme.domain, is_whole, scale, edge, start, is_backward, has_copies)
 
 
