@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby, product
+from operator import eq
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -284,17 +285,13 @@ def _has_clear_lamps(contents: SceneContents, rest: SceneNode) -> bool:
 def _moved_sensor(loaded: LoadedScene, before: SceneNode, seen: SceneNode) -> bool:
     """Change the sensor of a scene from one entry to another; False, without any change, if that cannot be."""
     parameters = mi.traverse(loaded.sensor)
-    changed = {name: value for name, value in seen.items() if not _is_equal(value, before.get(name))}
+    # Of transforms of Mitsuba, != is always False.
+    changed = {name: value for name, value in seen.items() if not eq(value, before.get(name))}
     named = {_TRAVERSED.get(name, name): value for name, value in changed.items()}
     if before.keys() != seen.keys() or not all(name in parameters for name in named):
         return False
     set_parameters(loaded.sensor, named)
     return True
-
-
-def _is_equal(a: Any, b: Any) -> bool:
-    is_transform = isinstance(a, mi.ScalarTransform4f)
-    return np.array_equal(np.array(a.matrix), np.array(b.matrix)) if is_transform else a == b
 
 
 def _turned(sensor: SceneNode, turn: NDArray[np.float64]) -> SceneNode:
