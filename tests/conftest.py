@@ -7,9 +7,10 @@ not compiled into Mitsuba, or has no backend on this machine, is skipped.
 import gc
 import os
 
-# All cores have tests to run: a BLAS of several threads in each process has them wait for each other, which takes twice
-# the time of the processors. Before NumPy is imported; processes that tests start have it from here.
+# All cores have tests to run: a BLAS or FLIP of several threads in each process has them wait for each other, which
+# takes twice the time of the processors. Before NumPy is imported; processes that tests start have it from here.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import quick_kernels  # noqa: F401, I001 - before drjit, as it chooses the LLVM library
 import drjit as dr
@@ -42,6 +43,7 @@ def pytest_collection_modifyitems(items):
 def pytest_collection_finish():
     # Otherwise a tenth of the time of tests is that of the garbage collector, which visits all tests again and again.
     gc.freeze()
+    gc.set_threshold(10_000)
 
 
 @pytest.fixture(scope="module", autouse=True)

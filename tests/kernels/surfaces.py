@@ -62,6 +62,12 @@ SURFACES = {
     "doo_sabin face of 50": ("doo_sabin", lambda: extraordinary_face(50)),
     "doo_sabin sheet": ("doo_sabin", lambda: sheet(4, 4)),
 }
+# One for each kind of piece and of border, for what takes long on all of them.
+KINDS = (
+    *("torus", "valence 50", "smooth triangles", "half disc of 6", "non-manifold", "corner", "semi-sharp ring"),
+    *("chaikin", "propeller", "loop mixed torus", "loop sheet", "loop corner", "doo_sabin mixed torus"),
+    "doo_sabin sheet",
+)
 # No element beside these holes has corners of its own.
 HOLES = {
     "hole in a cube": ("catmull_clark", lambda: tagged(cube(), holes=[1])),

@@ -3,7 +3,7 @@
 import drjit as dr
 import numpy as np
 import pytest
-from kernels.surfaces import kernel_named, on_device, surface_named, vectors
+from kernels.surfaces import KINDS, kernel_named, on_device, surface_named, vectors
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels.surface_kernel import SurfaceKernel
@@ -23,11 +23,7 @@ COUNT = 20_000
 # A parameter is a sum of three products of numbers up to one.
 ROUNDED = {DOUBLE: 1e-15, SINGLE: 5e-7}
 
-# One for each kind of piece and of border: the searches ask for points and derivatives only, which
-# test_surface_kernel compares on all surfaces.
-KINDS = ["torus", "valence 50", "smooth triangles", "half disc of 6", "non-manifold", "corner", "semi-sharp ring"]
-KINDS += ["chaikin", "propeller", "loop mixed torus", "loop sheet", "loop corner", "doo_sabin mixed torus"]
-KINDS += ["doo_sabin sheet"]
+# The searches ask for points and derivatives only, which test_surface_kernel compares on all surfaces.
 EVERY_KIND = pytest.mark.parametrize("name", KINDS)
 
 

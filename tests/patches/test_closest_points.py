@@ -5,7 +5,7 @@ Another path to them is a search by evaluation alone: many samples, and finer an
 
 import numpy as np
 import pytest
-from kernels.surfaces import SURFACES, surface_named
+from kernels.surfaces import KINDS, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.patches import closest_points
@@ -16,7 +16,6 @@ from patches.locations import grid_locations
 from reference.refined_cages import refine_first, sheet, tagged
 from scipy.spatial import cKDTree
 
-EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
 # Points of each kind: all around, near the surface, on it, and far away.
 COUNT = 6
 # Of distances, in sizes of the surface: both are sums of some tens of rounded products.
@@ -64,7 +63,7 @@ def along_tangents(points, found):
     return np.maximum(*parts)
 
 
-@EVERY_SURFACE
+@pytest.mark.parametrize("name", [*KINDS, "rook", "hexagon", "loop valence 50"])
 def test_found_points_are_the_nearest_and_ways_to_them_along_the_normal(name, np_rng):
     surface = surface_named(name)
     segments = max(3, round((SAMPLES / len(grid_locations(surface, 1)[0]) * 4) ** 0.5))
@@ -124,7 +123,7 @@ def test_extraordinary_points_are_found(valence):
     np.testing.assert_allclose(found.p[:5], np.repeat(pole.p, 5, axis=0), rtol=0, atol=1e-7)
 
 
-@pytest.mark.parametrize("name", ["valence 3", "valence 50", "dart", "loop valence 3", "doo_sabin face of 50"])
+@pytest.mark.parametrize("name", ["valence 3", "valence 50", "dart", "loop valence 3", "doo_sabin mixed torus"])
 def test_points_above_places_next_to_extraordinary_ones(name, np_rng):
     surface = surface_named(name)
     deep = np.repeat([2.0**-8, 2.0**-20, 2.0**-40], 3)[:, None]

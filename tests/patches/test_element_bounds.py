@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from kernels.surfaces import SURFACES, surface_named
+from kernels.surfaces import KINDS, SURFACES, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from patches.closed_cages import bumpy, cage_of
@@ -65,7 +65,7 @@ def bent(scheme):
 
 @pytest.mark.parametrize(
     ("make", "name"),
-    [(surface_named, name) for name in SURFACES] + [(bent, name) for name in ("catmull_clark", "loop", "doo_sabin")],
+    [(surface_named, name) for name in KINDS] + [(bent, name) for name in ("catmull_clark", "loop", "doo_sabin")],
 )
 def test_boxes_are_tight(make, name):
     surface = make(name)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from kernels.surfaces import SURFACES, surface_named
+from kernels.surfaces import KINDS, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
 from patches.closed_cages import bumpy, cage_of, creased
@@ -55,8 +55,9 @@ def test_area_of_a_cylinder_of_b_splines():
     np.testing.assert_allclose(LimitSurface(ControlCage(positions, faces)).area(), height * length, rtol=EXACT)
 
 
+# Extrapolation does less for many triangles around a vertex, and where surfaces bend at several levels.
 @pytest.mark.parametrize(
-    "name", [name for name in SURFACES if "50" not in name and name not in ("rook", "semi-sharp ring", "face of 20")]
+    "name", ["hexagon", "into a dart", *(k for k in KINDS if k not in ("valence 50", "semi-sharp ring"))]
 )
 def test_areas_are_limits_of_those_of_triangles(name):
     surface = surface_named(name)

@@ -9,7 +9,9 @@ import mitsuba as mi
 import numpy.fft  # noqa: F401
 import PIL.PngImagePlugin  # noqa: F401
 import pytest
+import scipy.ndimage  # noqa: F401
 from mitsuba_subdivision.__main__ import main
+from mitsuba_subdivision.regression import fixture, report  # noqa: F401
 from mitsuba_subdivision.regression.image import load_image
 
 pytest_plugins = ["pytester"]
@@ -32,7 +34,7 @@ def test_ball(render_regression):
 
 @pytest.fixture(autouse=True, scope="module")
 def loaded():
-    """Load all compiled modules first: pytester forgets what is imported in its runs, and they load only once."""
+    """Load all modules first: pytester forgets what is imported in its runs, and compiled ones load only once."""
     mi.set_variant("scalar_rgb")
 
 
