@@ -35,7 +35,7 @@ def test_a_thread_without_a_caller_can_warn(monkeypatch):
 def test_numbers_have_all_their_digits():
     numbers = [5.0, 3, 1.000000001, np.float32(0.1), np.nan, 1e300, [1.000000001, 0.5], np.array([1, 2])]
     expected = ["5", "3", "1.000000001", "0.1", "nan", "1e+300", "(1.000000001, 0.5)", "(1, 2)"]
-    assert [in_digits(each) for each in numbers] == expected
+    assert [in_digits(number) for number in numbers] == expected
 
 
 def test_numbers_just_outside_a_range_do_not_look_as_if_within():

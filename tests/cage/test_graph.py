@@ -13,8 +13,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWa
 
 @pytest.fixture(params=["mixed torus", "cube", "no manifold, book of three", "no manifold, pole of quads"])
 def cage(request):
-    own = {"mixed torus": mixed_torus, "cube": named_cages.cube}
-    return own[request.param]() if request.param in own else surface_of(SURFACES[request.param]).cage
+    manifolds = {"mixed torus": mixed_torus, "cube": named_cages.cube}
+    return manifolds[request.param]() if request.param in manifolds else surface_of(SURFACES[request.param]).cage
 
 
 def test_every_edge_is_there_once_and_triangles_cover_the_faces(cage):

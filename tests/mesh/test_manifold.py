@@ -166,8 +166,8 @@ def test_faces_that_cannot_agree_have_sharp_edges_between_them_and_others_beside
     assert np.array_equal(cage.face_vertices, np.concatenate(strip(1).faces))
     beside = joined(strip(1), fidelity_cages.grid(6, 6), {0: 2, 1: 4})
     turned = ControlCage(beside.positions, [face[:: -1 if f == 27 else 1] for f, face in enumerate(beside.faces)])
-    for each in (cage, cage_of(beside), turned):
-        assert each.non_manifold.is_edge.sum() == 2
+    for twisted in (cage, cage_of(beside), turned):
+        assert twisted.non_manifold.is_edge.sum() == 2
 
 
 def test_fans_beside_a_spine_hold_it():
@@ -197,7 +197,7 @@ def test_boundary_none_keeps_faces_at_edges_of_many_faces():
 def test_the_first_ones_are_named():
     with pytest.warns(CageWarning) as record:
         ControlCage(np.random.default_rng(1).random((9, 3)), [[0, 1, 2], [1, 0, 3], [0, 1, 4], [5, 6, 6], [2, 7, 8]])
-    assert [str(each.message) for each in record] == [
+    assert [str(warning.message) for warning in record] == [
         "control cage: the faces are no manifold: 1 edge of more than two faces, or of two in one direction (edge (0, "
         "1)); 1 vertex between separate fans (vertex 2); 1 face with a vertex more than once (face 3). Such edges are "
         "infinitely sharp, and such vertices are corners or lie on creases along these edges, as in OpenSubdiv; strict "
@@ -278,9 +278,9 @@ def test_values_of_pages_are_held_where_they_differ_along_the_spine(triangles, m
         held = {0, spine - 1, *(vertex for a in apart for vertex in (a - 1, a, a + 1) if 0 <= vertex < spine)}
         held_once |= held
         for faces in (np.flatnonzero(page == k) for k in range(pages)):
-            rows, own = np.unique(indices[faces], return_inverse=True)
-            vertex = dict(zip(own.ravel().tolist(), corners[faces].ravel().tolist(), strict=True))
-            alone = ControlCage(values[rows], own.reshape(len(faces), -1))
+            rows, corner_rows = np.unique(indices[faces], return_inverse=True)
+            vertex = dict(zip(corner_rows.ravel().tolist(), corners[faces].ravel().tolist(), strict=True))
+            alone = ControlCage(values[rows], corner_rows.reshape(len(faces), -1))
             is_linear = alone.topology.is_border_vertex if mode == "boundaries" else np.zeros(len(rows), dtype=bool)
             fixed = [(row, 10) for row, v in vertex.items() if v in held or (is_linear[row] and v >= spine)]
             alone = msub.LimitSurface(tagged(alone, corners=fixed), scheme)

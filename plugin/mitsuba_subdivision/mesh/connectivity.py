@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import ragged
-from .ragged import first_indices, sorted_order
+from .ragged import IntArray, first_indices, sorted_order
 from .sharpness import SemiSharpness
 
-# Integers of any width; docstrings state the width where it matters.
-IntArray = NDArray[np.integer]
 # Indices of half-edges, faces and edges. int32 halves the memory, and on large cages the time.
 IndexArray = NDArray[np.int32]
 

@@ -20,6 +20,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+# Integers of any width; docstrings state the width where it matters.
 IntArray = NDArray[np.integer]
 
 # Number of entries of a chunk of `chunks_of`.

@@ -20,7 +20,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-IntArray = NDArray[np.integer]
+from .ragged import IntArray
+
 FloatArray = NDArray[np.float64]
 
 # Least sharpness that is infinite, as in OpenSubdiv.

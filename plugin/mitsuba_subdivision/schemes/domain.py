@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..mesh.connectivity import IntArray
+
 FloatArray = NDArray[np.floating]
-IntArray = NDArray[np.integer]
 
 
 class ParameterMap(NamedTuple):
