@@ -6,6 +6,7 @@ not compiled into Mitsuba, or has no backend on this machine, is skipped.
 
 import gc
 import os
+from collections import defaultdict
 
 # All cores have tests to run: a BLAS or FLIP of several threads in each process has them wait for each other, which
 # takes twice the time of the processors. Before NumPy is imported; processes that tests start have it from here.
@@ -30,14 +31,23 @@ IN_ONE_THREAD = {
 }
 
 
-def pytest_collection_modifyitems(items):
-    """Leave out exact shading in scalar variants, which have none."""
+# Of each core law, so that `-m core` takes half a minute: spread evenly over all of them.
+CORE_CASES = 4
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leave out exact shading in scalar variants, which have none, and with `-m core` most cases of each law."""
 
     def is_kept(item):
         given = [v for v in item.callspec.params.values() if isinstance(v, str)] if hasattr(item, "callspec") else []
         return "exact" not in given or not any(v.startswith("scalar_") for v in given)
 
     items[:] = filter(is_kept, items)
+    if config.option.markexpr == "core":
+        laws = defaultdict(list)
+        for item in items:
+            laws[item.nodeid.partition("[")[0]].append(item)
+        items[:] = [item for cases in laws.values() for item in cases[:: -(-len(cases) // CORE_CASES)]]
 
 
 def pytest_collection_finish():

@@ -238,7 +238,6 @@ def around(mesh, vertex):
 LASTING, CLOSE = 22, 1e-9
 
 
-@pytest.mark.core
 @pytest.mark.parametrize("method", ["uniform", "chaikin"])
 @pytest.mark.parametrize("scheme", BALLS)
 def test_lasting_features_have_the_limits_of_brute_force(scheme, method, np_rng):

@@ -106,7 +106,6 @@ class WholeLoop(Loop):
     has_local_borders = False
 
 
-@pytest.mark.core
 @pytest.mark.parametrize(
     ("scheme", "whole", "corner"),
     [(CatmullClark(), WholeCatmullClark(), 0), (Loop(), WholeLoop(), 0), (Loop(), WholeLoop(), 10)],
