@@ -47,7 +47,6 @@ class PatchFrames:
     vertex: IndexArray
     # (n_h,) bool: whether positions along the edge of a half-edge are counted from the half-edge's end
     is_backward: NDArray[np.bool_]
-    has_copies: bool  # Whether several edges or vertices of the topology have the same number
 
     @classmethod
     def of(
@@ -66,8 +65,7 @@ class PatchFrames:
             start = control_of_vertex.astype(np.int32)[start]
             edge[border] = first_sides(t, border, start)
             is_backward[border] = start[border] != start[edge[border]]
-        has_copies = bool((start != t.face_vertices).any() or (edge[border] != border).any())
-        return cls(t, patches.scheme.domain, is_whole, scale, edge, start, is_backward, has_copies)
+        return cls(t, patches.scheme.domain, is_whole, scale, edge, start, is_backward)
 
 
 def tile_type(corner_count: int) -> np.dtype[np.void]:
@@ -277,8 +275,8 @@ class AdaptiveGrid:
 
     def copies(self) -> IntArray:
         """`VertexTable.copies`: vertices on the second side of each crease, and the same vertices on the first side."""
-        frames = self.frames
-        if not frames.has_copies:
+        frames, t = self.frames, self.frames.topology
+        if np.array_equal(frames.edge, t.edge_half_edge[t.edge]) and np.array_equal(frames.vertex, t.face_vertices):
             return np.empty((2, 0), dtype=np.int64)
         shared, first_of_shared = self._numbered(frames.edge, frames.vertex)
         number, first = self._numbers
