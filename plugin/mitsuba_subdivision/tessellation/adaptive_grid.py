@@ -47,6 +47,7 @@ class PatchFrames:
     vertex: IndexArray
     # (n_h,) bool: whether positions along the edge of a half-edge are counted from the half-edge's end
     is_backward: NDArray[np.bool_]
+    has_copies: bool  # Whether several edges or vertices of the topology have the same number
 
     @classmethod
     def of(
@@ -58,14 +59,18 @@ class PatchFrames:
         t, is_split = patches.elements, patches.refined is not None
         is_whole = patches.is_whole & (not is_split)
         scale = np.where(patches.is_whole & is_split, 0.5, 1.0)
-        edge = t.edge_half_edge[t.edge]
-        is_backward = edge != np.arange(t.half_edge_count)
-        start, border = t.face_vertices, np.flatnonzero(t.twin < 0)
+        half_edge = np.arange(t.half_edge_count, dtype=np.int32)
+        edge = np.where(t.twin < 0, half_edge, np.minimum(half_edge, t.twin))
+        is_backward = edge != half_edge
+        start, border, has_copies = t.face_vertices, np.flatnonzero(t.twin < 0), False
         if patches.scheme.element == "face":
-            start = control_of_vertex.astype(np.int32)[start]
+            has_copies = not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex)))
+            if has_copies:
+                start = control_of_vertex.astype(np.int32)[start]
             edge[border] = first_sides(t, border, start)
             is_backward[border] = start[border] != start[edge[border]]
-        return cls(t, patches.scheme.domain, is_whole, scale, edge, start, is_backward)
+            has_copies |= bool((edge[border] != border).any())
+        return cls(t, patches.scheme.domain, is_whole, scale, edge, start, is_backward, has_copies)
 
 
 def tile_type(corner_count: int) -> np.dtype[np.void]:
@@ -275,8 +280,8 @@ class AdaptiveGrid:
 
     def copies(self) -> IntArray:
         """`VertexTable.copies`: vertices on the second side of each crease, and the same vertices on the first side."""
-        frames, t = self.frames, self.frames.topology
-        if np.array_equal(frames.edge, t.edge_half_edge[t.edge]) and np.array_equal(frames.vertex, t.face_vertices):
+        frames = self.frames
+        if not frames.has_copies:
             return np.empty((2, 0), dtype=np.int64)
         shared, first_of_shared = self._numbered(frames.edge, frames.vertex)
         number, first = self._numbers
