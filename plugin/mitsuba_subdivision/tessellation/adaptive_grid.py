@@ -219,14 +219,14 @@ class AdaptiveGrid:
     def of(cls, tiles: Tiles, frames: PatchFrames) -> AdaptiveGrid:
         """The grid of tiles. Tiles of two elements that meet more than once get more segments."""
         t, m = frames.topology, frames.domain.corner_count
-        keeps_corner = np.zeros((len(tiles), m), dtype=bool)
+        keeps_corner = np.broadcast_to(False, (len(tiles), m))
         needs_inner = (tiles["depth"] == 0) & _meets_twice(frames)[t.face[tiles["corner"]]]
         is_valence_two = (t.vertex_face_count > 0) & (t.vertex_face_count <= 2) & ~t.is_border_vertex
         if is_valence_two.any():
             # At vertices of valence 2, no triangle cuts off the corner of a tile: two tiles meet along both sides, and
             # both would have the same triangle.
             half_edge = sides_of(tiles, frames, int(tiles["depth"].max(initial=0))).at_vertices(m)
-            keeps_corner |= (half_edge >= 0) & is_valence_two[t.face_vertices[half_edge]]
+            keeps_corner = (half_edge >= 0) & is_valence_two[t.face_vertices[half_edge]]
             needs_inner |= keeps_corner.any(axis=1)
         if needs_inner.any():
             # With inner samples, the only inner edges that join two points of the sides cut off a corner.
