@@ -55,8 +55,16 @@ def interrupt(*_):
     raise KeyboardInterrupt("answer")
 
 
-def raises_answer():
-    return pytest.raises(AnswerError, match=r"^answer$")
+@contextlib.contextmanager
+def raises_answer(kind=AnswerError):
+    """As it is, or as the cause of Dr.Jit's own error."""
+    with pytest.raises((kind, RuntimeError)) as caught:
+        yield
+    error = caught.value
+    while type(error) is RuntimeError:
+        error = error.__cause__
+    assert type(error) is kind
+    assert str(error) == "answer"
 
 
 def complete_by(monkeypatch, function):
@@ -117,10 +125,9 @@ def test_an_error_is_raised_by_what_caused_it_and_by_nothing_else(monkeypatch, c
         with monkeypatch.context() as during:
             for answer, error in ((fail, AnswerError), (fail, AnswerError), (interrupt, KeyboardInterrupt)):
                 during.setattr(owner, name, answer)
-                with pytest.raises(error, match=r"^answer$"):
+                with raises_answer(error):
                     ask()
         np.testing.assert_array_equal(np.array(ask()), expected)
-    assert sys.gettrace() is None
     assert capfd.readouterr().err == ""
 
 
@@ -140,19 +147,6 @@ def test_errors_pass_through_loops_and_derivatives(monkeypatch):
     complete_by(monkeypatch, lambda _, si, *__: dr.while_loop((mi.UInt32(si.prim_index),), lambda i: i < 3, fail))
     with raises_answer():
         interaction(make())
-
-
-@llvm
-def test_with_a_debugger_errors_are_causes(monkeypatch):
-    scene, tracer = scene_of(make()), sys.gettrace()
-    complete_by(monkeypatch, fail)
-    sys.settrace(lambda *_: None)
-    try:
-        with pytest.raises(RuntimeError, match="RenderOp") as caught:
-            mi.render(scene, spp=1)
-    finally:
-        sys.settrace(tracer)
-    assert isinstance(caught.value.__cause__, AnswerError)
 
 
 @every_array_variant
@@ -181,7 +175,7 @@ def test_errors_go_with_their_last_name(monkeypatch):
     complete_by(monkeypatch, complete)
     gc.disable()
     try:
-        with contextlib.suppress(AnswerError):
+        with contextlib.suppress(AnswerError, RuntimeError):
             mi.render(scene, spp=1)
         assert {reference() for reference in alive} == {None}
     finally:

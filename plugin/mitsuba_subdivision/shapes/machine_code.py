@@ -13,12 +13,11 @@ import ctypes
 import mmap
 import signal
 import struct
-import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import cache, lru_cache
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import Any, NoReturn
 
 import mitsuba as mi
@@ -53,8 +52,6 @@ _WORD = ctypes.sizeof(ctypes.c_void_p)
 BEFORE = 2
 # Upper bound of the number of entries of a table. The table of Mitsuba's meshes has 66.
 _MOST_ENTRIES = 96
-# Packages whose frames `_raise_itself` skips.
-_LIBRARIES = ("mitsuba", "drjit")
 
 # Machine code for functions that store their arguments in the frame: the first at `rbp` - 0x18, the sixth at `rbp` -
 # 0x40. The seventh is passed on the stack, at `rbp` + 0x10.
@@ -363,74 +360,17 @@ def _jump_if_equal(distance: int) -> bytes:
 
 
 def _fail(error: BaseException, trace: TracebackType) -> NoReturn:
-    """Raise an error of Python so that the caller of Mitsuba receives the original error; C++ throws it on.
-
-    ``error`` may have been raised before the first line of the function that was called.
-    """
-    original = error.with_traceback(trace)
-    # Dr.Jit raises a `RuntimeError` from every error in a loop or a derivative.
-    while type(original) is RuntimeError and original.__cause__ is not None:
-        original = original.__cause__
-    # Frames of the error refer to C++ memory that will be freed.
-    _clear_frames(error)
-    _raise_itself(original, sys._getframe().f_back)
+    """Raise an error of Python, which C++ throws on; it may have been raised before the first line of the function."""
+    error = error.with_traceback(trace)
+    # Frames of the error and its causes refer to C++ memory that will be freed.
+    cause: BaseException | None = error
+    seen: list[BaseException] = []
+    while cause is not None and cause not in seen:
+        seen.append(cause)
+        traceback.clear_frames(cause.__traceback__)
+        cause = cause.__cause__ or cause.__context__
     try:
-        raise original from original.__cause__
+        raise error from error.__cause__
     finally:
         # Break the reference cycle with the traceback, which contains this frame.
-        del original, error, trace
-
-
-def _clear_frames(error: BaseException) -> None:
-    """Clear the local variables in the tracebacks of an error and its causes."""
-    for cause in _causes(error):
-        traceback.clear_frames(cause.__traceback__)
-
-
-def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """Iterate over an error and its chain of causes."""
-    seen: list[BaseException] = []
-    while error is not None and error not in seen:
-        seen.append(error)
-        yield error
-        error = error.__cause__ or error.__context__
-
-
-def _raise_itself(
-    error: BaseException,  # Error that will be raised through C++
-    frame: FrameType | None,  # Frame that called C++; None in threads that Python did not start
-) -> None:
-    """Raise an error in the user's code that called Mitsuba, instead of the error that C++ raises from it.
-
-    Uses Python's trace function. Under a debugger, which needs this function, the error of C++ is raised.
-    """
-    caller = _caller(frame)
-    if caller is None or sys.gettrace() is not None:
-        return
-
-    errors = [error]
-
-    def look(_: FrameType, event: str, argument: Any) -> None:
-        # Called for the error of C++, or for the next line if the caller has handled it.
-        sys.settrace(None)
-        caller.f_trace = None
-        error = errors.pop()
-        try:
-            if event == "exception" and argument[1] is not error and error in _causes(argument[1]):
-                raise error
-        finally:
-            # Break the reference cycle with the traceback, which contains this frame.
-            del error, argument
-
-    caller.f_trace = look
-    sys.settrace(lambda *_: None)
-
-
-def _caller(frame: FrameType | None) -> FrameType | None:
-    """The innermost frame outside of all frames of Mitsuba and Dr.Jit."""
-    caller = frame
-    while frame is not None:
-        if frame.f_globals.get("__name__", "").partition(".")[0] in _LIBRARIES:
-            caller = frame.f_back
-        frame = frame.f_back
-    return caller
+        del error, trace, seen, cause
