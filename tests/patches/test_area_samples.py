@@ -71,7 +71,7 @@ def test_points_are_uniform_inside_elements(name):
     bounds = surface.bounds()
     element = int(bounds.element[np.linalg.norm(bounds.upper - bounds.lower, axis=1).argmax()])
     # What `sample` evaluates, of which there have to be many for enough of them to lie in one element.
-    start, uv = uniform_locations(surface._surface_pieces, surface._areas, 5 * COUNT, np.random.default_rng(2))
+    start, uv = uniform_locations(surface._surface_pieces, surface._areas[0], 5 * COUNT, np.random.default_rng(2))
     elements, corners = surface._element_and_corner(start)
     own = elements == element
     if surface.patches.is_whole[element]:

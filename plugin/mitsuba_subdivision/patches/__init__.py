@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from ..deferred import deferred
 
 if TYPE_CHECKING:
-    from .area_samples import AreaSamples, SamplingCells, SurfaceAreas, uniform_locations
+    from .area_samples import AreaSamples, SamplingCells, surface_areas, uniform_locations
     from .channel import Channel, ChannelLayout, contracts_alike
     from .closest_points import ClosestPoints, ClosestPointSearch
     from .energies import energy_matrix, gradients, hessians
@@ -29,20 +29,20 @@ __all__ = [
     "PieceTable",
     "SamplingCells",
     "StencilMatrices",
-    "SurfaceAreas",
     "SurfacePieces",
     "contracts_alike",
     "energy_matrix",
     "gradients",
     "hessians",
     "stencil_matrices",
+    "surface_areas",
     "uniform_locations",
 ]
 
 __getattr__ = deferred(
     __name__,
     {
-        "area_samples": ("AreaSamples", "SamplingCells", "SurfaceAreas", "uniform_locations"),
+        "area_samples": ("AreaSamples", "SamplingCells", "surface_areas", "uniform_locations"),
         "channel": ("Channel", "ChannelLayout", "contracts_alike"),
         "closest_points": ("ClosestPointSearch", "ClosestPoints"),
         "energies": ("energy_matrix", "gradients", "hessians"),

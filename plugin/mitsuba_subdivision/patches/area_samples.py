@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.irregular_patch import IrregularPatch
 from ..evaluation.polynomials import BernsteinBasis, times
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
-from .polynomial_pieces import PolynomialPieces, SurfacePieces
+from .polynomial_pieces import PolynomialPieces, SurfacePieces, Tips
 
 # Tolerance of the area of the surface, divided evenly among the pieces; and rounding error of a piece's area. Both are
 # relative.
@@ -35,36 +35,23 @@ UNEVEN, CELL_HALVINGS = 1.25, 3
 TIP_LEVELS = 2
 
 
-@dataclass(frozen=True, eq=False)
-class SurfaceAreas:
-    """Areas of a surface's pieces."""
+def surface_areas(pieces: SurfacePieces) -> tuple[list[FloatArray], float]:
+    """Measure a surface.
 
-    regular: FloatArray  # (n,) float64: areas of `SurfacePieces.regular`
-    # tuple of (levels, 3, t) float64: areas of the pieces of the levels, for each of `SurfacePieces.tips`
-    tips: tuple[FloatArray, ...]
-    rest: float  # Area of the levels beyond these
-
-    @classmethod
-    def of(cls, pieces: SurfacePieces) -> SurfaceAreas:
-        """Measure a surface."""
-        parts = [pieces.regular, *(tips.level(0) for tips in pieces.tips)]
-        rough = sum(float(_measured(part, ORDERS[0])[1].sum()) for part in parts)
-        count = len(pieces.regular) + sum(3 * _level_count(tips.patch) * len(tips) for tips in pieces.tips)
-        tolerance = TOLERANCE * rough / count
-        tip_areas, rest = [], 0.0
-        for tips in pieces.tips:
-            levels = range(_level_count(tips.patch))
-            areas = np.stack([piece_areas(tips.level(level), tolerance) for level in levels])
-            tip_areas.append(areas.reshape(len(levels), 3, -1))
-            last, before = (tip_areas[-1][k].sum(axis=0) for k in (-1, -2))
-            factor = np.divide(last, before, out=np.zeros_like(last), where=before > 0)
-            rest += float((last * factor / (1 - np.minimum(factor, 1 / 2))).sum())
-        return cls(piece_areas(pieces.regular, tolerance), tuple(tip_areas), rest)
-
-    @property
-    def total(self) -> float:
-        """The area of the surface."""
-        return float(self.regular.sum() + sum(areas.sum() for areas in self.tips) + self.rest)
+    Returns the areas of the pieces of `SurfacePieces.parts` for `level_count`, and of all that is beyond these levels.
+    """
+    first_parts = pieces.parts(lambda _: 1)
+    rough = sum(float(_measured(part(), ORDERS[0])[1].sum()) for part in first_parts)
+    count = len(pieces.regular) + sum(3 * level_count(tips) * len(tips) for tips in pieces.tips)
+    tolerance = TOLERANCE * rough / count
+    areas, rest = [piece_areas(part(), tolerance) for part in pieces.parts(level_count)], 0.0
+    end = 1
+    for tips in pieces.tips:
+        end += level_count(tips)
+        before, last = (level_areas.reshape(3, -1).sum(axis=0) for level_areas in areas[end - 2 : end])
+        factor = np.divide(last, before, out=np.zeros_like(last), where=before > 0)
+        rest += float((last * factor / (1 - np.minimum(factor, 1 / 2))).sum())
+    return areas, rest
 
 
 def piece_areas(pieces: PolynomialPieces, tolerance: float) -> FloatArray:
@@ -96,9 +83,10 @@ def _area_elements(du: FloatArray, dv: FloatArray) -> FloatArray:
     return unit * unit * np.sqrt((b * f - c * e) ** 2 + (c * d - a * f) ** 2 + (a * e - b * d) ** 2)
 
 
-def _level_count(patch: IrregularPatch) -> int:
+def level_count(tips: Tips) -> int:
     """Number of levels whose areas are measured, see `TAIL`."""
-    return int(np.ceil(np.log(TAIL) / np.log(patch.basis.moduli[1] * patch.basis.moduli[2])))
+    moduli = tips.patch.basis.moduli
+    return int(np.ceil(np.log(TAIL) / np.log(moduli[1] * moduli[2])))
 
 
 def _measured(pieces: PolynomialPieces, orders: tuple[int, int]) -> FloatArray:
@@ -152,7 +140,10 @@ class AreaSamples:
 
 
 def uniform_locations(
-    pieces: SurfacePieces, areas: SurfaceAreas, count: int, rng: np.random.Generator
+    pieces: SurfacePieces,
+    areas: Sequence[FloatArray],  # `surface_areas`
+    count: int,
+    rng: np.random.Generator,
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Draw random locations on a surface, uniform by area.
 
@@ -163,34 +154,19 @@ def uniform_locations(
     Returns ``half_edge``, (count,) int64: the corner of an element at which parameters start, a half-edge of
     `PatchTable.elements`; and ``uv``, (count, 2) float64.
     """
-    flat_areas = [areas.regular, *(tip_areas.ravel() for tip_areas in areas.tips)]
-    cumulative = np.cumsum(np.concatenate(flat_areas))
+    cumulative = np.cumsum(np.concatenate(areas))
     chosen = np.searchsorted(cumulative, rng.random(count) * cumulative[-1], side="right")
     half_edge, uv = np.empty(count, dtype=np.int64), np.empty((count, 2))
-    for samples, level_pieces, piece in _chosen_pieces(pieces, areas, chosen):
-        used, used_index = np.unique(piece, return_inverse=True)
-        used_pieces = level_pieces.chosen(used)
-        uv_in_piece = _uniform_in_pieces(used_pieces, used_index, rng)
-        half_edge[samples] = used_pieces.half_edge[used_index]
-        uv[samples] = used_pieces.chosen(used_index).parameters(uv_in_piece)
+    bounds = np.cumsum([0, *map(len, areas)])
+    for part, begin, end in zip(pieces.parts(level_count), bounds[:-1], bounds[1:], strict=True):
+        samples = np.flatnonzero((chosen >= begin) & (chosen < end))
+        if len(samples):
+            used, used_index = np.unique(chosen[samples] - begin, return_inverse=True)
+            used_pieces = part().chosen(used)
+            uv_in_piece = _uniform_in_pieces(used_pieces, used_index, rng)
+            half_edge[samples] = used_pieces.half_edge[used_index]
+            uv[samples] = used_pieces.chosen(used_index).parameters(uv_in_piece)
     return half_edge, uv
-
-
-def _chosen_pieces(
-    pieces: SurfacePieces, areas: SurfaceAreas, chosen: IntArray
-) -> list[tuple[IntArray, PolynomialPieces, IntArray]]:
-    """Group samples by regular pieces and by levels of tips. Returns samples, pieces, and each sample's piece."""
-    in_regular: IntArray = np.flatnonzero(chosen < len(pieces.regular))
-    groups: list[tuple[IntArray, PolynomialPieces, IntArray]] = [(in_regular, pieces.regular, chosen[in_regular])]
-    begin = len(pieces.regular)
-    for tips, tip_areas in zip(pieces.tips, areas.tips, strict=True):
-        in_tips = np.flatnonzero((chosen >= begin) & (chosen < begin + tip_areas.size))
-        sample_level, piece = np.divmod(chosen[in_tips] - begin, tip_areas[0].size)
-        for level in np.unique(sample_level).tolist():
-            in_level = sample_level == level
-            groups.append((in_tips[in_level], tips.level(level), piece[in_level]))
-        begin += tip_areas.size
-    return groups
 
 
 def _uniform_in_pieces(pieces: PolynomialPieces, which: IntArray, rng: np.random.Generator) -> FloatArray:
@@ -226,15 +202,20 @@ class SamplingCells:
     areas: FloatArray  # (n,) float64: area of the surface over each cell
 
     @classmethod
-    def build(cls, pieces: SurfacePieces, areas: SurfaceAreas) -> SamplingCells:
+    def build(
+        cls,
+        pieces: SurfacePieces,
+        areas: Sequence[FloatArray],  # `surface_areas`
+    ) -> SamplingCells:
         """Cover a surface with cells; one cell covers all levels from `TIP_LEVELS` on around an extraordinary point."""
-        parts = _even_parts(pieces.regular, areas.regular)
-        for tips, tip_areas in zip(pieces.tips, areas.tips, strict=True):
+        (regular, *levels), scale, end = areas, 2.0**-TIP_LEVELS, 0
+        parts = _even_parts(pieces.regular, regular)
+        for tips in pieces.tips:
+            begin, end = end, end + level_count(tips)
             for level in range(TIP_LEVELS):
-                parts += _even_parts(tips.level(level), tip_areas[level].ravel())
-            scale = 2.0**-TIP_LEVELS
-            deeper_areas = tip_areas[TIP_LEVELS:].sum(axis=(0, 1))
-            parts.append((tips.half_edge, scale * tips.matrices, tips.offsets, deeper_areas))
+                parts += _even_parts(tips.level(level), levels[begin + level])
+            deeper = np.sum(levels[begin + TIP_LEVELS : end], axis=0).reshape(3, -1).sum(axis=0)
+            parts.append((tips.half_edge, scale * tips.matrices, tips.offsets, deeper))
         return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from operator import itemgetter
 from typing import Any, TypeVar
 
@@ -16,7 +16,7 @@ from ..evaluation.patch_tree import PatchTree, patch_trees
 from ..evaluation.polynomials import BernsteinBasis, polynomial_basis, times
 from ..mesh.connectivity import IntArray, Topology
 from ..messages import counted
-from ..schemes.domain import FloatArray
+from ..schemes.domain import FloatArray, ParameterMap
 from .patch_table import PatchTable
 
 # Size, relative to the patch, down to which levels around extraordinary points are bounded by Bernstein coefficients,
@@ -98,15 +98,9 @@ class PolynomialPieces(PartArrays):
 
     def halved(self) -> PolynomialPieces:
         """The four quarters of each piece: the first quarters of all pieces, then the second ones, and so on."""
-        maps = [child.inverse() for child in self.basis.domain.children]
-        return PolynomialPieces(
-            self.basis,
-            np.tile(self.half_edge, 4),
-            np.concatenate([self.matrices @ from_child.matrix for from_child in maps]),
-            np.concatenate([self.matrices @ from_child.offset + self.offsets for from_child in maps]),
-            np.tile(self.origins, (4, 1)),
-            np.concatenate([half @ self.coefficients for half in self.basis.halves]),
-        )
+        places = places_below(self, [child.inverse() for child in self.basis.domain.children])
+        coefficients = np.concatenate([half @ self.coefficients for half in self.basis.halves])
+        return PolynomialPieces(self.basis, *places, np.tile(self.origins, (4, 1)), coefficients)
 
     def middles(self) -> tuple[FloatArray, IntArray, FloatArray]:
         """``(n, 3)`` points at the middle of the pieces' domains, and their locations: `half_edge` and parameters."""
@@ -147,17 +141,11 @@ class Tips(PartArrays):
 
     def level(self, level: int) -> PolynomialPieces:
         """The regular pieces of a level: the first children of all tips, then the second ones, and so on."""
-        rows, maps = level_rows(self.patch, level)[:, :, 1:], level_domains(self.patch, level)
+        rows, places = level_rows(self.patch, level)[:, :, 1:], places_below(self, level_domains(self.patch, level))
         coefficients = rows.reshape(-1, rows.shape[2]) @ self.coordinates[:, 1:]
         by_child = coefficients.reshape(len(self), *rows.shape[:2], 3).swapaxes(0, 1)
-        return PolynomialPieces(
-            polynomial_basis(self.patch.scheme).bernstein,
-            np.tile(self.half_edge, len(rows)),
-            np.concatenate([self.matrices @ from_child.matrix for from_child in maps]),
-            np.concatenate([self.matrices @ from_child.offset + self.offsets for from_child in maps]),
-            np.tile(self.points, (len(rows), 1)),
-            by_child.reshape(-1, *by_child.shape[2:]),
-        )
+        basis, origins = polynomial_basis(self.patch.scheme).bernstein, np.tile(self.points, (len(rows), 1))
+        return PolynomialPieces(basis, *places, origins, by_child.reshape(-1, *by_child.shape[2:]))
 
     def reach(self, level: int) -> FloatArray:
         """``(t, 3)`` bounds along the axes of the distance from the point to the surface at this and deeper levels."""
@@ -166,6 +154,20 @@ class Tips(PartArrays):
 
 
 _Placed = TypeVar("_Placed", PolynomialPieces, Tips)
+
+
+def places_below(
+    parts: PolynomialPieces | Tips, domains: Sequence[ParameterMap]
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """``half_edge``, ``matrices`` and ``offsets`` of the same parts of all parts, one after the other.
+
+    ``domains`` map the parameters of each part of a part to those of the latter.
+    """
+    return (
+        np.tile(parts.half_edge, len(domains)),
+        np.concatenate([parts.matrices @ domain.matrix for domain in domains]),
+        np.concatenate([parts.matrices @ domain.offset + parts.offsets for domain in domains]),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,6 +179,11 @@ class SurfacePieces:
     # (n_e, 3) float64: largest absolute coordinates of the control points of each element's patches; zero for holes
     # and other faces of `PatchTable.elements` without corners
     sizes: FloatArray
+
+    def parts(self, level_count: Callable[[Tips], int]) -> list[Callable[[], PolynomialPieces]]:
+        """Functions that return the regular pieces, and those of each of the first levels of tips."""
+        levels = [partial(tips.level, level) for tips in self.tips for level in range(level_count(tips))]
+        return [lambda: self.regular, *levels]
 
     @classmethod
     def build(
@@ -310,10 +317,9 @@ def element_bounds(
                 divided, origins = times(matrix, columns), pieces_of_size.origins[run]
                 widen(pieces_of_size.half_edge[run], origins + divided.min(axis=0).T, origins + divided.max(axis=0).T)
 
-    widen_by(pieces.regular)
+    for part in pieces.parts(lambda tips: tips.bounded_levels):
+        widen_by(part())
     for tips in pieces.tips:
-        for level in range(tips.bounded_levels):
-            widen_by(tips.level(level))
         reach = tips.reach(tips.bounded_levels)
         widen(tips.half_edge, tips.points - reach, tips.points + reach)
     rounded = UNITS * UNIT * pieces.sizes

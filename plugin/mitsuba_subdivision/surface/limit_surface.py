@@ -43,7 +43,6 @@ if TYPE_CHECKING:
         PieceTable,
         SamplingCells,
         StencilMatrices,
-        SurfaceAreas,
         SurfacePieces,
     )
     from ..patches.energies import Density
@@ -289,7 +288,8 @@ class LimitSurface:
         SchemeError
             As `bounds`.
         """
-        return self._areas.total
+        areas, rest = self._areas
+        return float(sum(part_areas.sum() for part_areas in areas) + rest)
 
     def stiffness(self, order: int = 4) -> sparse.csr_array:
         """Stiffness matrix of the surface: Dirichlet's energy of functions that are subdivided as points are.
@@ -370,10 +370,10 @@ class LimitSurface:
         """
         if not isinstance(count, numbers.Integral) or count < 0:
             raise ValueError(f"count {count!r}; expected an integer of 0 or more")
-        if not self._areas.total > 0:
+        if not self.area() > 0:
             raise ValueError(f"{self.cage.source.name}: the surface has no area; expected one to draw points from")
         half_edge, uv = patches.uniform_locations(
-            self._surface_pieces, self._areas, int(count), np.random.default_rng(seed)
+            self._surface_pieces, self._areas[0], int(count), np.random.default_rng(seed)
         )
         samples = self._sampler.evaluate(half_edge, uv)
         return patches.AreaSamples(
@@ -423,11 +423,11 @@ class LimitSurface:
         return element_bounds(self._surface_pieces, self.patches.elements)
 
     @cached_property
-    def _areas(self) -> SurfaceAreas:
-        return patches.SurfaceAreas.of(self._surface_pieces)
+    def _areas(self) -> tuple[list[FloatArray], float]:
+        return patches.surface_areas(self._surface_pieces)
 
     def _sampling_cells(self) -> SamplingCells:
-        return patches.SamplingCells.build(self._surface_pieces, self._areas)
+        return patches.SamplingCells.build(self._surface_pieces, self._areas[0])
 
     @cached_property
     def _closest_point_search(self) -> ClosestPointSearch:
