@@ -7,8 +7,10 @@ array has a number or a vector for each lane; inactive lanes read zeros and writ
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Callable
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import drjit as dr
 import numpy as np
@@ -42,24 +44,26 @@ Ray = Any
 NO_CONFLICTS = dr.ReduceMode.NoConflicts
 _UPLOADED: Shared[SharedArray] = Shared()
 
+# Arrays that each thread has computed, by `LaterArrays`.
+_of_thread = threading.local()
+
 
 class LaterArrays:
-    """A value of `Shared` that computes its arrays at their first use, as this waits for Dr.Jit."""
+    """A value of `Shared` that computes its arrays at their first use in each thread.
+
+    Kernels of a thread do not wait for those of another, and waiting would begin other work that Dr.Jit has queued.
+    """
 
     # Without `__dict__`, so that Dr.Jit does not traverse it as a shape's state.
-    __slots__ = ("__weakref__", "_arrays")
-
-    def __init__(self) -> None:
-        self._arrays: Any = None
+    __slots__ = ("__weakref__",)
 
     def get(self, compute: Callable[[], Any]) -> Any:
-        """Return the arrays; the first call computes them, and waits: kernels of other threads would not."""
-        if self._arrays is None:
-            arrays = compute()
-            dr.eval(arrays)
-            dr.sync_thread()
-            self._arrays = arrays
-        return self._arrays
+        """Return the arrays; the first call in a thread computes them."""
+        computed = _of_thread.__dict__.setdefault("arrays", WeakKeyDictionary())
+        if self not in computed:
+            computed[self] = compute()
+            dr.eval(computed[self])
+        return computed[self]
 
 
 class ArrayTypes:
