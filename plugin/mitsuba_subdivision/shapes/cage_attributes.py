@@ -84,11 +84,8 @@ class CageAttributes:
             f"{PREFIX}{name}": flat_type(shared.array) for name, shared in self._given.items()
         }
         self.moving: set[str] = set()  # Names of the parameters that move vertices
-        self._upsampling = {
-            name: SpectralUpsampling.shared(variant)
-            for name, channel in self._channels.items()
-            if holds_spectra(variant, mesh_name(name), channel.values.shape[1])
-        }
+        sizes = {name: channel.values.shape[1] for name, channel in self._channels.items()}
+        self._upsampling = spectral_upsampling(variant, sizes)
         # Functions that take each new array of an attribute's values.
         self._followers: dict[str, list[Callable[[FloatBuffer], None]]] = {}
         # Updated values of attributes, as watched for reverse-mode passes.
@@ -230,21 +227,19 @@ def mesh_attributes(cage: ControlCage) -> dict[str, int]:
     return sizes
 
 
-def holds_spectra(variant: Variant, mesh_name: str, size: int) -> bool:
-    """Whether Mitsuba stores spectra for a mesh attribute of this name and number of components.
+def spectral_upsampling(variant: Variant, sizes: dict[str, int]) -> dict[str, SpectralUpsampling]:
+    """Conversion of each attribute for which Mitsuba stores spectra, by names and numbers of components.
 
     Mitsuba looks for "color" only; USD's "displayColor" is a colour, too.
     """
-    return bool(variant.is_spectral) and size == 3 and "color" in mesh_name.lower()
+    colors = [name for name, size in sizes.items() if size == 3 and "color" in name.lower()]
+    if not (colors and variant.is_spectral):
+        return {}
+    return dict.fromkeys(colors, _UPSAMPLING.get(variant, lambda: SpectralUpsampling(variant)))
 
 
 class SpectralUpsampling:
     """Conversion of colours to coefficients of spectra, differentiable in JIT variants."""
-
-    @classmethod
-    def shared(cls, variant: Variant) -> SpectralUpsampling:
-        """The object of a variant, shared by its shapes while it is referenced."""
-        return _UPSAMPLING.get(variant, lambda: cls(variant))
 
     def __init__(
         self,

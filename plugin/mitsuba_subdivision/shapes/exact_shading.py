@@ -24,7 +24,7 @@ from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation import AttributeLayout, AttributeTable
 from ..variants import Variant
-from .cage_attributes import WIDTHS, SpectralUpsampling, holds_spectra, mesh_name
+from .cage_attributes import WIDTHS, mesh_name, spectral_upsampling
 from .placement import Placement
 
 if TYPE_CHECKING:
@@ -82,11 +82,8 @@ class ExactShading:
             for name, attribute in surface.cage.attributes.items()
             if attribute.values.shape[1] in WIDTHS
         }
-        self._upsampling = {
-            name: SpectralUpsampling.shared(variant)
-            for name, channel in self._attributes.items()
-            if holds_spectra(variant, name, channel.values.size)
-        }
+        sizes = {name: channel.values.size for name, channel in self._attributes.items()}
+        self._upsampling = spectral_upsampling(variant, sizes)
         self._shape: Callable[[], mi.Mesh | None] = lambda: None
         self._sign = 1.0
 
@@ -204,23 +201,15 @@ class ExactShading:
         """Count hits by kind and log the counts of the last kernel, at the log level Debug."""
         if mi.log_level() > mi.LogLevel.Debug:
             return
-        counts = self.take_counts()
+        counts = np.array(self._counts).tolist()
         if sum(counts):
             shares = ", ".join(
                 f"{count / sum(counts):.2%} {where}" for count, where in zip(counts, _KINDS, strict=True)
             )
             log: Any = mi.Log  # Mitsuba's stub declares this function as an object.
             log(mi.LogLevel.Debug, f"{self._name}: of {sum(counts)} hits, {shares}")
-        dr.scatter_add(self._counts, self.kernel.types.index(1), kind, active)
-
-    def take_counts(self) -> list[int]:
-        """Return the numbers of hits on the ray, along a normal, and without intersection since the last call.
-
-        Hits are only counted at the log level Debug.
-        """
-        counts = np.array(self._counts).tolist()
         self._counts = dr.zeros(self.kernel.types.index, len(_KINDS))
-        return counts
+        dr.scatter_add(self._counts, self.kernel.types.index(1), kind, active)
 
     def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value | None:
         """Value of a mesh attribute; in spectral variants the coefficients of a colour's spectrum."""

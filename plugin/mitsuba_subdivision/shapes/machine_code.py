@@ -43,9 +43,8 @@ _LOWEST_BIT = 4
 _ERROR_SIZE = 128
 # Format strings of `PyObject_CallFunction`: seven 64-bit numbers, and two objects.
 _NUMBERS, _FAILURE = ctypes.c_char_p(b"KKKKKKK"), ctypes.c_char_p(b"OO")
-# Signals that C++ handles during a render. The handlers allocate memory, so they must not interrupt an allocation of
-# Python: these signals are blocked while Python runs.
-_SIGNALS = (signal.SIGINT,)
+# The set of SIGINT, which C++ handles during a render. The handler allocates memory, so it must not interrupt an
+# allocation of Python: the signal is blocked while Python runs.
 _SIGNAL_SET = ctypes.create_string_buffer(128)
 _WORD = ctypes.sizeof(ctypes.c_void_p)
 # Number of entries before the address of a virtual function table, which identify its class [Itanium C++ ABI, 2.5.2].
@@ -295,8 +294,7 @@ def _code_after(
 def _ask(function: Callable[..., None]) -> bytes:
     """Call Python with all arguments, and compare its result with NULL."""
     library, python = bindings(), ctypes.pythonapi
-    for number in _SIGNALS:
-        _c_library().sigaddset(_SIGNAL_SET, int(number))
+    _c_library().sigaddset(_SIGNAL_SET, int(signal.SIGINT))
     block = _BLOCK + _move("rsi", ctypes.addressof(_SIGNAL_SET)) + _call(library["pthread_sigmask"])
     enter = _call(python.PyGILState_Ensure) + _STATE_OF_RESULT
     arguments = _move("rdi", id(function)) + _move("rsi", _NUMBERS) + _FIRST_FOUR
