@@ -24,6 +24,8 @@ ROUNDED = 1e-13
 ALONG_NORMAL = 1e-9
 # Of parameters: the same steps, but for rounding of sums over other numbers of points.
 DESCENT = 1e-12
+# Pieces that may hold the nearest point, for points that are far away.
+FEW_PIECES = 80
 # Samples that a search by evaluation begins with, and how often it is made twice as fine.
 SAMPLES, REFINED = 3_000, 8
 STEPS = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 2), axis=-1).reshape(-1, 2)
@@ -240,6 +242,20 @@ def test_a_collapsed_surface_is_a_point():
     found = LimitSurface(cube().with_positions(np.ones((8, 3)))).closest_point([[1.0, 1.0, 4.0]])
     np.testing.assert_allclose(found.p, [[1, 1, 1]], rtol=0, atol=1e-14)
     np.testing.assert_array_equal(found.n, [[0, 0, 0]])
+
+
+@pytest.mark.parametrize("name", ["rook", "semi-sharp ring", "loop mixed torus"])
+def test_far_points_are_compared_with_few_pieces(name, np_rng, monkeypatch):
+    surface, counts, near = surface_named(name), [], BoxTree.near
+
+    def counted(tree, points, squared_distance):
+        pairs = near(tree, points, squared_distance)
+        counts.append(len(pairs[0]) / len(points))
+        return pairs
+
+    monkeypatch.setattr(BoxTree, "near", counted)
+    surface.closest_point(100 * np_rng.normal(size=(50, 3)))
+    assert np.mean(counts) < FEW_PIECES
 
 
 @pytest.mark.core

@@ -31,9 +31,6 @@ FLAT_SLOPE = 1e-10
 # Size, relative to the patch, down to which levels around an extraordinary point are searched. The point itself stands
 # for the smaller ones.
 SMALLEST = 2.0**-44
-# Relative excess over the least distance of the known point at which a search begins. Far from the surface, finding
-# the nearest known point takes much longer.
-NEARLY = 0.02
 # Points per run of a query, which bounds temporary memory to some hundred megabytes.
 CHUNK = 1 << 17
 
@@ -107,7 +104,7 @@ class ClosestPointSearch:
 
     def _nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
         size = self._size + float(np.abs(points).max(initial=0))
-        distance, nearest = self._known.query(points, eps=NEARLY)
+        distance, nearest = self._known.query(points)
         first: IntArray = np.asarray(nearest)
         best = _Best(points, size, np.asarray(distance) ** 2, self._start[first], self._uv[first])
         begins = np.flatnonzero(first < len(self._pieces))
