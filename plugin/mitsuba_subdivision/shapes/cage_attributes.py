@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ..cage.errors import warn
 from ..device_arrays import take_over, upload
-from ..kernels.array_types import Float, FloatBuffer, Index, Mask, Value
+from ..kernels.array_types import ArrayTypes, Float, FloatBuffer, Index, Mask, Value
 from ..mesh.shared import Shared, SharedArray
 from ..variants import Variant
 from .derivatives import Watched, computed_ones, warn_of_lost
@@ -145,8 +145,6 @@ class CageAttributes:
         """Flat array of values; in JIT variants, meshes with equal values share it."""
         if self._float is None:
             return SharedArray(values.ravel())
-        from ..kernels.array_types import ArrayTypes
-
         return ArrayTypes(self._float).shared_floats(values)
 
     def _stored(self, name: str) -> FloatBuffer:

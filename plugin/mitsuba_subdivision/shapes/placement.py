@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device_arrays import mapped
-from ..kernels.array_types import FloatBuffer, Matrix4
+from ..kernels.array_types import ArrayTypes, FloatBuffer, Matrix4
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -119,7 +119,6 @@ class Placement:
         """Map flat positions and unit normals from object space to world space."""
         matrix = self.matrix
         if dr.is_jit_v(matrix):
-            from ..kernels.array_types import ArrayTypes
             from ..kernels.vertex_kernel import placed
 
             return placed(positions, normals, matrix, ArrayTypes(type(positions)).vector3)

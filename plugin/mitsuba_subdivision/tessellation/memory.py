@@ -67,12 +67,11 @@ def require_memory_for_triangles(count: int) -> None:
         )
 
 
-def exceeded_limit(needed: float, most: int | None = None) -> int | None:
-    """The smaller of the available bytes and ``most``, if less than ``needed``; else None."""
+def exceeded_limit(needed: float) -> int | None:
+    """The available bytes if less than ``needed``; else None."""
     if needed <= SMALL:
         return None
-    limits = [limit for limit in (available_memory(), most) if limit is not None]
-    limit = min(limits, default=None)
+    limit = available_memory()
     return None if limit is None or needed <= limit else limit
 
 
