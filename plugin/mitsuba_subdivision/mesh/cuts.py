@@ -223,7 +223,7 @@ def _uncut_fans(topology: Topology, is_border: NDArray[np.bool_], closed_fans: I
 def semi_sharpness_of_cut(
     mesh: SharpMesh,  # The mesh before the cut
     cut: CutMesh,  # The mesh after it, with the rules of its vertices
-    is_cut: NDArray[np.bool_],  # (n_h,) bool: whether each half-edge lies on the cut
+    is_cut: NDArray[np.bool_],  # (n_h,) bool: whether each half-edge lies on the cut; not read where infinitely sharp
     # (n,) bool: whether semi-sharp edges across the cut sharpen each vertex of the cut mesh. By default all vertices.
     is_sharpened_across: NDArray[np.bool_] | None = None,
 ) -> SemiSharpness | None:
@@ -349,7 +349,7 @@ def value_mesh(
     is_sharpened_across = ~differs[vertex]
     if mode in _SHARPENED_ACROSS:
         is_sharpened_across[copies] = _is_sharpened_by_other(mesh, seam, cut, copies)
-    semi_sharpness = semi_sharpness_of_cut(mesh, cut, seam | mesh.tags.is_infinite, is_sharpened_across)
+    semi_sharpness = semi_sharpness_of_cut(mesh, cut, seam, is_sharpened_across)
     return cut.topology.with_rules(rules, semi_sharpness), value_index
 
 
