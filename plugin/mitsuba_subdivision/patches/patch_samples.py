@@ -28,14 +28,17 @@ WEIGHTS = 1 << 19
 
 
 def located_runs(
-    patches: PatchTable, half_edge: IntArray, uv: FloatArray
+    patches: PatchTable,
+    # (s,) int64: class and corner of each sample, as from `PatchTable.patch_at`
+    class_index: IntArray,
+    corner: IntArray,
+    uv: FloatArray,  # (s, 2) float64: parameters, starting at that corner
 ) -> Iterator[tuple[IntArray, LocatedSamples, list[PatchClass]]]:
-    """Locate samples, given as for `PatchSampler.evaluate`, in runs sorted by class, so that a run has few classes.
+    """Locate samples in runs sorted by class, so that a run has few classes.
 
     Iterates over the indices of samples, their locations, and the classes that are the elements of these.
     """
     scheme, classes = patches.scheme, patches.classes
-    class_index, _, corner = patches.patch_at(half_edge)
     order = np.argsort(class_index.astype(np.min_scalar_type(len(classes))), kind="stable")
     ends = np.cumsum(patches.control_counts[class_index[order]]) // WEIGHTS
     runs = np.split(order, np.flatnonzero(np.diff(ends)) + 1) if len(order) else []
@@ -66,9 +69,9 @@ class PatchSampler:
         derivatives: int = 1,
     ) -> SurfaceSamples:
         """Evaluate points, derivatives and normals at samples."""
-        _, patch, _ = self.patches.patch_at(half_edge)
+        class_index, patch, corner = self.patches.patch_at(half_edge)
         samples = SurfaceSamples.empty(len(uv), self.control_values.shape[1], dtype, derivatives)
-        for run, located, classes in located_runs(self.patches, half_edge, uv):
+        for run, located, classes in located_runs(self.patches, class_index, corner, uv):
             points = [
                 self._values.take(patch_class.controls.take(patch[run[of_class]], axis=0), axis=0)
                 for patch_class, of_class in zip(classes, located.slices(), strict=True)
@@ -136,7 +139,7 @@ def stencil_matrices(
     distinct, ends = order[begins], np.append(begins, len(order))
     none = np.empty(0, dtype=np.int32), np.empty(0, dtype=np.int32), np.empty(0)
     entries = [[none] for _ in range(count)]
-    for run, located, classes in located_runs(patches, half_edge[distinct], uv[distinct]):
+    for run, located, classes in located_runs(patches, class_index[distinct], corner[distinct], uv[distinct]):
         for patch_class, of_class, weights in zip(classes, located.slices(), stencils(located), strict=True):
             # The distinct samples of a class are consecutive.
             bounds = ends[run[of_class.start] : run[of_class.stop - 1] + 2]
