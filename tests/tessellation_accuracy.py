@@ -24,7 +24,9 @@ import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
-from mitsuba_subdivision.tessellation import Criterion, Measure, Sensor, UniformGrid, VertexTable
+from mitsuba_subdivision.tessellation.criterion import Criterion, Measure, Sensor
+from mitsuba_subdivision.tessellation.uniform_grid import UniformGrid
+from mitsuba_subdivision.tessellation.vertex_table import VertexTable
 from scipy.spatial import cKDTree
 
 CAGES = Path(__file__).resolve().parents[1] / "scenes" / "cages"

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from .shapes.tessellation_parameters import pixel_error_for
     from .studio import render_denoised, studio_scene
     from .surface import LimitSurface, SurfaceSamples
-    from .tessellation import Tessellation, VertexMatrices
+    from .tessellation.vertex_table import Tessellation, VertexMatrices
 
 __all__ = [
     "AreaSamples",
@@ -79,7 +79,7 @@ _NAMES = {
     "shapes.tessellation_parameters": ("pixel_error_for",),
     "studio": ("render_denoised", "studio_scene"),
     "surface": ("LimitSurface", "SurfaceSamples"),
-    "tessellation": ("Tessellation", "VertexMatrices"),
+    "tessellation.vertex_table": ("Tessellation", "VertexMatrices"),
 }
 
 

@@ -29,7 +29,6 @@ from mitsuba_subdivision.messages import counted
 from mitsuba_subdivision.schemes import SchemeError
 from mitsuba_subdivision.studio import PolygonMesh, box_corners, frame_table, points_at, set_parameters
 from mitsuba_subdivision.surface import LimitSurface
-from mitsuba_subdivision.tessellation import VertexTable
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
@@ -68,7 +67,7 @@ class CachedSurface:
         return positions[self._used] if self._frame_table is None else self._frame_table.apply(positions)[0]
 
     @cached_property
-    def _frame_table(self) -> VertexTable | None:
+    def _frame_table(self) -> Any:
         return frame_table(self.surface) if self.surface.cage.face_count < DENSE else None
 
     @cached_property

@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.tessellation import Criterion, Measure, Sensor
+from mitsuba_subdivision.tessellation.criterion import Criterion, Measure, Sensor
 from processes import measured, peak_memory
 
 OUTLINES = "outlines"

@@ -9,7 +9,7 @@ from gradients.surfaces import ALL
 from mitsuba_subdivision.kernels import VertexKernel
 from mitsuba_subdivision.kernels.vertex_kernel import placed
 from mitsuba_subdivision.llvm import llvm_problem
-from mitsuba_subdivision.tessellation import Criterion, Measure
+from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
 
 pytestmark = pytest.mark.skipif(llvm_problem() is not None, reason="no usable LLVM")
 

@@ -7,7 +7,7 @@ import pytest
 from mitsuba_subdivision import LimitSurface, pixel_error_for, upload
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.shapes.tessellation_parameters import sensor_in_world
-from mitsuba_subdivision.tessellation import Criterion, Measure
+from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
 from patches.closed_cages import bumpy
 from reference.refined_cages import tagged
 from shapes.cages import cube, described, load

@@ -132,7 +132,7 @@ def test_an_update_of_to_world_is_a_new_shape(monkeypatch, cage, name):
     shape, to_world = make(cage), transformation(name)
     with monkeypatch.context() as patched:
         # Weights are not made again.
-        patched.setattr("mitsuba_subdivision.tessellation.uniform_table", None)
+        patched.setattr("mitsuba_subdivision.surface.limit_surface.uniform_table", None)
         update(shape, to_world=to_world)
     expected = make(cage, to_world=to_world)
     assert_alike(shape, expected)

@@ -11,8 +11,15 @@ from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.cage.named_cages import extraordinary, torus
 from mitsuba_subdivision.evaluation.polynomials import BernsteinBasis
 from mitsuba_subdivision.schemes.domain import SQUARE
-from mitsuba_subdivision.tessellation import Criterion, DisplacementBound, Measure, Sensor
-from mitsuba_subdivision.tessellation.criterion import BESIDE_OUTLINE, Cone, least_product
+from mitsuba_subdivision.tessellation.criterion import (
+    BESIDE_OUTLINE,
+    Cone,
+    Criterion,
+    DisplacementBound,
+    Measure,
+    Sensor,
+    least_product,
+)
 from patches.closed_cages import bumpy
 from reference.refined_cages import sheet
 from scipy.spatial import ConvexHull

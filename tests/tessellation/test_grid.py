@@ -4,7 +4,7 @@ from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
 from mitsuba_subdivision.schemes.domain import SQUARE, TRIANGLE
-from mitsuba_subdivision.tessellation import UniformGrid
+from mitsuba_subdivision.tessellation.uniform_grid import UniformGrid
 from patches.closed_cages import SURFACES, cage_of
 
 # Odd and even, each more than once: from here on they differ in numbers only.

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.tessellation import Criterion, Measure, uniform_table
+from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
 from mitsuba_subdivision.tessellation.memory import available_memory
+from mitsuba_subdivision.tessellation.uniform import uniform_table
 from patches.closed_cages import triangulated
 
 MEGABYTE = 1 << 20

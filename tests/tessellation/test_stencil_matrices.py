@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision import Attribute, LimitSurface
-from mitsuba_subdivision.tessellation import Criterion, Measure
+from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
 from patches.closed_cages import bumpy, cage_of, mixed_torus
 from peers.fidelity_cages import SURFACES
 from peers.test_fidelity import surface_of

@@ -15,7 +15,7 @@ from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..regression.tiers import normal_angle
 from ..schemes import scheme_named
 from ..surface import LimitSurface
-from ..tessellation import Tessellation
+from ..tessellation.vertex_table import Tessellation
 from .cages import edge_curves
 from .characteristic import patch_of_valence
 from .output import FigureError, FigureOptions, panels, scientific, show, write_figure

@@ -11,13 +11,13 @@ import numpy as np
 
 from ..patches.piece_table import CODE, CORNERS, FOLLOWING, NOTHING, PRECEDING, TWIN, WHOLE
 from ..schemes.domain import ParameterDomain
-from ..tessellation import UniformGrid
+from ..tessellation.uniform_grid import UniformGrid
 from .array_types import ArrayTypes, Float, Index, Index4, Mask
 
 if TYPE_CHECKING:
     from ..patches import PieceTable
-    from ..tessellation import VertexTable
     from ..tessellation.adaptive_grid import AdaptiveGrid
+    from ..tessellation.vertex_table import VertexTable
 
 
 @dataclass(frozen=True, eq=False)

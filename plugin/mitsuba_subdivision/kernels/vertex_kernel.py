@@ -17,7 +17,7 @@ from .array_types import NO_CONFLICTS, ArrayTypes, Float, FloatBuffer, Index, In
 from .linear_maps import SparseMatrix, WeightBlocks, attached
 
 if TYPE_CHECKING:
-    from ..tessellation import VertexPolynomials, VertexTable
+    from ..tessellation.vertex_table import VertexPolynomials, VertexTable
 
 # Least divisor when `UnitNormal` divides a tangent by its longest component, so that the cross product neither under-
 # nor overflows. A shorter tangent means that the patch has collapsed to a point or a curve.

@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from ..cage import ControlCage
     from ..patches import Channel
     from ..surface import LimitSurface
-    from ..tessellation import AttributeTable, VertexTable
+    from ..tessellation.attribute_table import AttributeTable
+    from ..tessellation.vertex_table import VertexTable
 
 PREFIX = "cage_"
 # Names of attributes whose buffers would be those of every Mitsuba mesh.

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from scipy import sparse
 
     from ..surface import LimitSurface
-    from ..tessellation import AttributeTable, VertexTable
+    from ..tessellation.attribute_table import AttributeTable
+    from ..tessellation.vertex_table import VertexTable
     from .displacement import ShapeDisplacement
 
 

@@ -23,7 +23,7 @@ from ..kernels.surface_kernel import SurfaceKernel
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
-from ..tessellation import DisplacementBound
+from ..tessellation.criterion import DisplacementBound
 from ..variants import Variant
 from .cage_attributes import mesh_name
 from .device_state import is_recording

@@ -22,14 +22,14 @@ from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
-from ..tessellation import AttributeLayout, AttributeTable
+from ..tessellation.attribute_table import AttributeLayout, AttributeTable
 from ..variants import Variant
 from .cage_attributes import WIDTHS, mesh_name, spectral_upsampling
 from .placement import Placement
 
 if TYPE_CHECKING:
     from ..kernels.channel_kernel import ChannelKernel
-    from ..tessellation import VertexTable
+    from ..tessellation.vertex_table import VertexTable
     from .interaction_hook import TriangleHit
 
 # Cosine of the angle between a ray and the normals that `_facing` turns to a silhouette.

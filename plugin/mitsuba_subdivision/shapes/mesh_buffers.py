@@ -24,7 +24,8 @@ from .placement import Placement
 if TYPE_CHECKING:
     from ..kernels import VertexKernel
     from ..kernels.surface_kernel import SurfaceKernel
-    from ..tessellation import AttributeTable, VertexTable
+    from ..tessellation.attribute_table import AttributeTable
+    from ..tessellation.vertex_table import VertexTable
     from .displaced_vertices import DisplacedVertices
     from .displacement import ShapeDisplacement
     from .exact_shading import ExactShading

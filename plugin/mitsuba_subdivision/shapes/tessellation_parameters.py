@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     import mitsuba as mi
 
     from ..surface import LimitSurface
-    from ..tessellation import DisplacementBound, Sensor, VertexTable
+    from ..tessellation.criterion import DisplacementBound, Sensor
+    from ..tessellation.vertex_table import VertexTable
 
 # Parameters of the limit of an adaptive tessellation. Exactly one must be given.
 LIMITS = ("chord_error", "pixel_error", "max_edge")
@@ -44,7 +45,7 @@ class Tessellation:
         """Prepare the tessellation. A uniform one does not depend on the control points."""
         if self.limit is None:
             return surface.sampling(self.rate)
-        from ..tessellation import Criterion, DisplacementBound, Measure
+        from ..tessellation.criterion import Criterion, DisplacementBound, Measure
 
         if bound is not None:
             # The spectral norm is the largest factor by which the linear map scales a length.
@@ -130,7 +131,7 @@ def sensor_in_world(
     height: int,
 ) -> Sensor:
     """Make the sensor of error criteria."""
-    from ..tessellation import Sensor
+    from ..tessellation.criterion import Sensor
 
     eye, axis = to_world[:3, 3], to_world[:3, 2]
     if not fov:

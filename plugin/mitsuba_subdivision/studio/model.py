@@ -15,7 +15,7 @@ from ..cage import ControlCage, named_cages
 from ..cage.errors import CageSource, shortened, warn
 from ..files.formats import FORMATS
 from ..surface import LimitSurface
-from ..tessellation import VertexTable
+from ..tessellation.vertex_table import VertexTable
 from ..variants import SceneNode
 from .obj_materials import Material, read_materials
 from .picture import MOST_SEGMENTS, highest_rate, outline_for, segments_for, triangles_for

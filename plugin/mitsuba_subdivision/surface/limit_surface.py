@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from .. import patches, tessellation
+from .. import patches
 from ..cage import ControlCage
 from ..cage.contents import Attribute
 from ..cage.errors import CageError
@@ -22,6 +22,9 @@ from ..mesh.shared import Shared
 from ..refinement.adapted_scheme import adapted_scheme
 from ..schemes import Scheme
 from ..schemes.domain import FloatArray
+from ..tessellation.attribute_table import AttributeTable
+from ..tessellation.uniform import uniform_table
+from ..tessellation.vertex_table import Tessellation, VertexMatrices, VertexTable
 from ..variants import variant_name
 from .arguments import checked_elements, checked_form, checked_samples, require_derivatives, require_valences
 
@@ -46,7 +49,7 @@ if TYPE_CHECKING:
         SurfacePieces,
     )
     from ..patches.energies import Density
-    from ..tessellation import AttributeTable, Criterion, Tessellation, VertexMatrices, VertexTable
+    from ..tessellation.criterion import Criterion
 
 # Name of the texture coordinates among the attributes.
 TEXCOORDS = "texcoords"
@@ -506,7 +509,7 @@ class LimitSurface:
 
         Surfaces of the same topology, tags and rules share the table of a rate while it is referenced.
         """
-        return tessellation.uniform_table(self.patches, rate, self.cage.cut_mesh.vertex, self.cage.vertex_count)
+        return uniform_table(self.patches, rate, self.cage.cut_mesh.vertex, self.cage.vertex_count)
 
     def adaptive_sampling(
         self, criterion: Criterion, max_rate: int = 64, control_points: FloatArray | None = None
@@ -540,7 +543,9 @@ class LimitSurface:
             points = np.asarray(control_points, dtype=np.float64)
             if points.shape != shape or not np.isfinite(points).all():
                 raise ValueError(f"control points of shape {points.shape}; expected finite ones of shape {shape}")
-        return tessellation.adaptive_table(
+        from ..tessellation.adaptive import adaptive_table
+
+        return adaptive_table(
             self.patches, self.cage.cut_mesh.vertex, points, criterion, max_rate, self.cage.source.name
         )
 
@@ -579,7 +584,7 @@ class LimitSurface:
         mesh = self.attribute_table(table)
         values = {name: attribute_values.copy() for name, attribute_values in mesh.values.items()}
         texcoords = values.pop(TEXCOORDS, None)
-        return tessellation.Tessellation(
+        return Tessellation(
             mesh.gathered(positions), mesh.gathered(normals), mesh.triangles, table.element, texcoords, values
         )
 
@@ -597,10 +602,10 @@ class LimitSurface:
         ValueError, MemoryError
             As `tessellate`.
         """
-        if not isinstance(table, tessellation.VertexTable):
+        if not isinstance(table, VertexTable):
             table = self.sampling(table)
         points, *tangents = self._matrices(*table.locations(), limit_stencils, 3)
-        return tessellation.VertexMatrices(points[table.weld_target], *tangents)
+        return VertexMatrices(points[table.weld_target], *tangents)
 
     def attribute_table(self, table: VertexTable) -> AttributeTable:
         """Evaluate the cage's texture coordinates and attributes at the vertices of a tessellation.
@@ -611,7 +616,7 @@ class LimitSurface:
             If the scheme has no rules for one of them.
         """
         channels = {name: self.channel(name) for name in self.attribute_names}
-        return tessellation.AttributeTable.build(table, self.patches, self.cage.cut_mesh.vertex, channels)
+        return AttributeTable.build(table, self.patches, self.cage.cut_mesh.vertex, channels)
 
     def sample_vertices(
         self, table: VertexTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float

@@ -30,48 +30,5 @@ A patch belongs to a class (`PatchClass`), whose weights (`VertexPolynomials`) a
 The corner of an element is identified by the half-edge of `PatchTable.elements` that begins there.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from ..deferred import deferred
-
-if TYPE_CHECKING:
-    from .adaptive import adaptive_table
-    from .attribute_table import AttributeLayout, AttributeTable
-    from .criterion import Criterion, DisplacementBound, Measure, Sensor
-    from .uniform import uniform_table
-    from .uniform_grid import UniformGrid
-    from .vertex_table import Tessellation, VertexMatrices, VertexPolynomials, VertexTable
-
 # Segments along an edge of the control cage. Triangles are numbered by 32 bits, and memory ends long before that.
 HIGHEST_RATE = 1024
-
-__all__ = [
-    "HIGHEST_RATE",
-    "AttributeLayout",
-    "AttributeTable",
-    "Criterion",
-    "DisplacementBound",
-    "Measure",
-    "Sensor",
-    "Tessellation",
-    "UniformGrid",
-    "VertexMatrices",
-    "VertexPolynomials",
-    "VertexTable",
-    "adaptive_table",
-    "uniform_table",
-]
-
-__getattr__ = deferred(
-    __name__,
-    {
-        "adaptive": ("adaptive_table",),
-        "attribute_table": ("AttributeLayout", "AttributeTable"),
-        "criterion": ("Criterion", "DisplacementBound", "Measure", "Sensor"),
-        "uniform": ("uniform_table",),
-        "uniform_grid": ("UniformGrid",),
-        "vertex_table": ("Tessellation", "VertexMatrices", "VertexPolynomials", "VertexTable"),
-    },
-)
