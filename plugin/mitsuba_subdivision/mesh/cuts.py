@@ -13,24 +13,12 @@ from numpy.typing import NDArray
 
 from . import ragged
 from .connectivity import IntArray, Topology, VertexRule
-from .manifold import NonManifold
+from .manifold import NonManifold, fan_labels
 from .shared import Content, Shared
 from .sharpness import INFINITE, CreaseMethod, FloatArray, SemiSharpness
 
-# For each mode, the `_corner_conditions` under which a value at a seam is a corner.
-_NONE = ("corner", "torn")
-_CORNERS_ONLY = (*_NONE, "one_face")
-_CORNERS_PLUS1 = (*_CORNERS_ONLY, "many", "beside_torn")
-_CORNERS_PLUS2 = (*_CORNERS_PLUS1, "beside_one_face", "end_of_seam")
-_CORNERS = {
-    "none": _NONE,
-    "corners_only": _CORNERS_ONLY,
-    "corners_plus1": _CORNERS_PLUS1,
-    "corners_plus2": _CORNERS_PLUS2,
-    "boundaries": ("always",),
-}
-# Modes in which semi-sharp edges of one of two values at a vertex sharpen the other.
-_SHARPENED_ACROSS = ("corners_plus1", "corners_plus2")
+# Modes in which one of two values at a vertex may make the other a corner, or sharpen it by its semi-sharp edges.
+_CORNERS_PLUS = ("corners_plus1", "corners_plus2")
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +126,7 @@ class SharpMesh:
             face_vertices, vertex = _split_vertices(self, is_border)
             edge_names = np.where(is_cut, t.edge_count + np.arange(t.half_edge_count), t.edge)
             cut = CutMesh(Topology(len(vertex), t.face_sizes, face_vertices, edge_names, rules[vertex]), vertex)
-        semi_sharpness = semi_sharpness_of_cut(self, cut, is_cut)
+        semi_sharpness = semi_sharpness_of_cut(self, cut)
         return CutMesh(cut.topology.with_rules(cut.topology.vertex_rules, semi_sharpness), cut.vertex)
 
     @cached_property
@@ -190,7 +178,9 @@ def _split_vertices(
     # fans.
     begins = np.flatnonzero(is_border)
     if mesh.non_manifold is not None:
-        begins = np.concatenate([begins, _uncut_fans(t, is_border, mesh.non_manifold.closed_fans)])
+        closed_fans = mesh.non_manifold.closed_fans
+        is_divided = np.isin(closed_fans, fan_labels(t)[0][is_border])
+        begins = np.concatenate([begins, closed_fans[~is_divided]])
     begins = begins[np.argsort(t.face_vertices[begins], kind="stable")]
     is_later = np.zeros(len(begins), dtype=bool)
     is_later[1:] = np.diff(t.face_vertices[begins]) == 0
@@ -208,24 +198,14 @@ def _split_vertices(
     return face_vertices, vertex
 
 
-def _uncut_fans(topology: Topology, is_border: NDArray[np.bool_], closed_fans: IntArray) -> IntArray:
-    """Return the closed fans, each named by a half-edge, that no border edge divides."""
-    is_divided = is_border[closed_fans]
-    current, fan = closed_fans, np.arange(len(closed_fans))
-    while len(current):
-        current = topology.turn[current]
-        continues = current != closed_fans[fan]
-        current, fan = current[continues], fan[continues]
-        is_divided[fan] |= is_border[current]
-    return closed_fans[~is_divided]
-
-
 def semi_sharpness_of_cut(
     mesh: SharpMesh,  # The mesh before the cut
     cut: CutMesh,  # The mesh after it, with the rules of its vertices
-    is_cut: NDArray[np.bool_],  # (n_h,) bool: whether each half-edge lies on the cut; not read where infinitely sharp
-    # (n,) bool: whether semi-sharp edges across the cut sharpen each vertex of the cut mesh. By default all vertices.
-    is_sharpened_across: NDArray[np.bool_] | None = None,
+    seam: NDArray[np.bool_] | None = None,  # (n_h,) bool: whether each half-edge lies on a seam that is cut as well
+    # (n_v,) bool: vertices at which semi-sharp edges across the cut sharpen no copy
+    has_separate_copies: NDArray[np.bool_] | None = None,
+    # Whether these edges sharpen such copies nevertheless that are not semi-sharp themselves
+    sharpens_smooth: bool = False,
 ) -> SemiSharpness | None:
     """Return the semi-sharp features of a cut mesh, including semi-sharp edges across the cut.
 
@@ -248,29 +228,26 @@ def semi_sharpness_of_cut(
         return None
     rules, face_vertices = cut.topology.vertex_rules, cut.topology.face_vertices
     is_semi_sharp = ~sharpness.is_infinite & (t.twin >= 0) & (sharpness.edges > 0)
-    semi_sharp = np.where(is_semi_sharp, sharpness.edges, 0)
+    on_seam = np.zeros(t.half_edge_count, dtype=bool) if seam is None else seam
+    edges, vertices = np.where(is_semi_sharp & ~on_seam, sharpness.edges, 0), sharpness.vertices[cut.vertex]
+    is_sharpened = rules != VertexRule.CORNER
+    if has_separate_copies is not None:
+        is_smooth = (np.bincount(face_vertices, edges > 0, minlength=len(vertices)) == 0) & (vertices == 0)
+        is_sharpened &= ~has_separate_copies[cut.vertex] | (is_smooth & sharpens_smooth)
 
-    # The copies of all vertices, grouped by vertex.
-    copies = np.argsort(cut.vertex, kind="stable")
-    if method == "uniform":
-        # Edges across the cut do not affect corners, and a vertex with thousands of fans has as many corners.
-        copies = copies[rules[copies] != VertexRule.CORNER]
-    counts = np.bincount(cut.vertex[copies], minlength=t.vertex_count)
-
-    # Every pair of a semi-sharp half-edge and a copy of its origin.
+    # Every pair of a semi-sharp half-edge and a copy of its origin. Copies are grouped by vertex.
+    copies, counts = np.argsort(cut.vertex, kind="stable"), np.bincount(cut.vertex, minlength=t.vertex_count)
     half_edges = np.flatnonzero(is_semi_sharp)
     origin = t.face_vertices[half_edges]
     half_edge = np.repeat(half_edges, counts[origin])
     copy = copies[ragged.ranges(ragged.starts(counts)[origin], counts[origin])]
-    sharpens = ~is_cut[half_edge]
-    if is_sharpened_across is not None:
-        sharpens &= is_sharpened_across[copy]
-    is_across = (copy != face_vertices[half_edge]) | is_cut[half_edge]
+    sharpens = ~on_seam[half_edge] & is_sharpened[copy]
+    is_across = (copy != face_vertices[half_edge]) | on_seam[half_edge]
     if method == "uniform":
         is_across &= sharpens
-    across = copy[is_across], semi_sharp[half_edge[is_across]], sharpens[is_across]
-    vertices = np.where(rules == VertexRule.CORNER, 0, sharpness.vertices[cut.vertex])
-    return SemiSharpness.decaying(face_vertices, np.where(is_cut, 0, semi_sharp), vertices, *across, method)
+    across = copy[is_across], sharpness.edges[half_edge[is_across]], sharpens[is_across]
+    vertices = np.where(rules == VertexRule.CORNER, 0, vertices)
+    return SemiSharpness.decaying(face_vertices, edges, vertices, *across, method)
 
 
 def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:
@@ -329,10 +306,9 @@ def value_mesh(
     Returns the cage's mesh, cut along creases and seams, with the rules that the values follow (faces and half-edges
     keep their indices), and (n,) int64, the 0-based row of the attribute's values at each vertex.
     """
-    t = mesh.topology
+    t, creased = mesh.topology, mesh.cut
     seam = seams(t, indices)
     differs = _differs_from_surface(mesh, mode, seam, indices)
-    creased = mesh.cut
     topology, vertex = creased.topology, creased.vertex
     rules = topology.vertex_rules.copy()
     if seam.any():
@@ -344,22 +320,29 @@ def value_mesh(
     rules[copies] = _rules_at_seams(mesh, mode, vertex[copies], value_index[copies], topology.vertex_face_count[copies])
     if topology is creased.topology and np.array_equal(rules, topology.vertex_rules):
         return topology, value_index
-
     cut = CutMesh(topology.with_rules(rules, None), vertex)
-    is_sharpened_across = ~differs[vertex]
-    if mode in _SHARPENED_ACROSS:
-        is_sharpened_across[copies] = _is_sharpened_by_other(mesh, seam, cut, copies)
-    semi_sharpness = semi_sharpness_of_cut(mesh, cut, seam, is_sharpened_across)
+    # Of two copies, each may be sharpened by the other. Three or more are corners in these modes.
+    semi_sharpness = semi_sharpness_of_cut(mesh, cut, seam, differs, sharpens_smooth=mode in _CORNERS_PLUS)
     return cut.topology.with_rules(rules, semi_sharpness), value_index
 
 
 def _differs_from_surface(mesh: SharpMesh, mode: str, seam: NDArray[np.bool_], indices: IntArray) -> NDArray[np.bool_]:
-    """Return ``(n_v,)``: whether the rules of values at each vertex may differ from those of the surface."""
-    t = mesh.topology
-    differs = np.zeros(t.vertex_count, dtype=bool)
-    differs[t.face_vertices[seam]] = True
-    if mesh.non_manifold is not None:
-        differs |= _differs(t, mesh.non_manifold, indices)
+    """Return ``(n_v,)``: whether the rules of values at each vertex may differ from those of the surface.
+
+    They may at seams; where indices differ at a non-manifold vertex, or at an end of a non-manifold edge there; and at
+    boundary vertices that the mode makes corners.
+    """
+    t, non_manifold = mesh.topology, mesh.non_manifold
+    differs = t.ends_of(seam)
+    if non_manifold is not None:
+        at_vertices = np.flatnonzero(non_manifold.is_vertex[t.face_vertices])
+        vertices = t.face_vertices[at_vertices]
+        differs[vertices[_vary(vertices, indices[at_vertices])]] = True
+        sides = np.flatnonzero(non_manifold.is_edge & ~non_manifold.has_one_face)
+        edge, ends = non_manifold.edge[sides], np.stack([sides, t.next[sides]])
+        low, high = np.where(t.face_vertices[ends[0]] < t.face_vertices[ends[1]], ends, ends[::-1])
+        is_torn = _vary(edge, indices[low]) | _vary(edge, indices[high])
+        differs[t.face_vertices[ends[:, is_torn]]] = True
     if mode == "boundaries":
         differs |= mesh.is_boundary_vertex
     elif mode != "none":
@@ -367,86 +350,41 @@ def _differs_from_surface(mesh: SharpMesh, mode: str, seam: NDArray[np.bool_], i
     return differs
 
 
-def _differs(topology: Topology, non_manifold: NonManifold, indices: IntArray) -> NDArray[np.bool_]:
-    """Return ``(n_v,)``: whether indices differ at a non-manifold vertex, or at an end of a non-manifold edge there."""
-    t = topology
-
-    def varies(group: IntArray, values: IntArray, count: int) -> NDArray[np.bool_]:
-        """Return ``(count,)``: whether the values of each group differ."""
-        last = np.zeros(count, dtype=np.int64)
-        last[group] = values
-        differs = np.zeros(count, dtype=bool)
-        differs[group[last[group] != values]] = True
-        return differs
-
-    sides = np.flatnonzero(non_manifold.is_edge & ~non_manifold.has_one_face)
-    start, end = sides, t.next[sides]
-    # Two ends of each edge: first the end at the lower vertex, then the other.
-    is_down = t.face_vertices[start] > t.face_vertices[end]
-    edge_end = 2 * non_manifold.edge[sides].astype(np.int64)
-    count = 2 * int(non_manifold.edge.max()) + 2
-    edge_ends = np.concatenate([edge_end + is_down, edge_end + ~is_down])
-    torn = np.logical_or(*varies(edge_ends, indices[np.concatenate([start, end])], count).reshape(-1, 2).T)
-    is_torn = np.zeros(t.half_edge_count, dtype=bool)
-    is_torn[sides] = torn[non_manifold.edge[sides]]
-    vertices = np.flatnonzero(non_manifold.is_vertex[t.face_vertices])
-    return t.ends_of(is_torn) | varies(t.face_vertices[vertices], indices[vertices], t.vertex_count)
+def _vary(group: IntArray, values: IntArray) -> NDArray[np.bool_]:
+    """Return whether the values of each member's group differ."""
+    last = np.zeros(int(group.max(initial=-1)) + 1, dtype=np.int64)
+    last[group] = values
+    differs = np.zeros(len(last), dtype=bool)
+    differs[group[last[group] != values]] = True
+    return differs[group]
 
 
 def _rules_at_seams(
     mesh: SharpMesh, mode: str, vertex: IntArray, value_index: IntArray, face_count: IntArray
 ) -> NDArray[np.int8]:
-    """Return ``(c,)`` rules of copies of vertices, given each copy's vertex, value and number of faces."""
+    """Return ``(c,)`` rules of copies of vertices, given each copy's vertex, value and number of faces.
+
+    All copies of a vertex with the same value have the same rule, see `value_mesh`.
+    """
     # Pairs encoded as one number are sorted several times faster.
     value_count = int(value_index.max(initial=0)) + 1
     pairs, value_of = np.unique(vertex * value_count + value_index, return_inverse=True)
-    holds = _corner_conditions(mesh, pairs // value_count, np.bincount(value_of), np.bincount(value_of, face_count))
-    is_corner = np.any([holds[condition] for condition in _CORNERS[mode]], axis=0)
-    return np.where(is_corner, VertexRule.CORNER, VertexRule.AUTOMATIC).astype(np.int8)[value_of]
-
-
-def _corner_conditions(
-    mesh: SharpMesh,
-    vertex: IntArray,  # (c,) int: the mesh's vertex of each value
-    copy_count: IntArray,  # (c,) int: number of the vertex's copies with each value
-    face_count: IntArray,  # (c,) int: number of the vertex's faces with each value
-) -> dict[str, NDArray[np.bool_]]:
-    """Return the conditions under which a value at a seam may be a corner, each ``(c,)``.
-
-    A value stands for all copies of one vertex that have the same row of the attribute.
-    """
-    count = mesh.topology.vertex_count
+    vertex, count = pairs // value_count, mesh.topology.vertex_count
     vertex_value_count = np.bincount(vertex, minlength=count)[vertex]
-    is_corner = mesh.is_corner if mesh.non_manifold is None else mesh.is_corner | mesh.non_manifold.is_vertex
     # Torn: the faces with the value are on different sides of another seam or crease, or touch only at the vertex.
-    is_torn, has_one_face = copy_count > 1, face_count == 1
+    is_torn, has_one_face = np.bincount(value_of) > 1, np.bincount(value_of, face_count) == 1
 
     def one_of_two(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return whether the value is one of two at its vertex, and a condition holds for either of them."""
         return (vertex_value_count == 2) & (np.bincount(vertex, holds, minlength=count)[vertex] > 0)
 
-    return {
-        "always": np.ones(len(vertex), dtype=bool),
-        "corner": is_corner[vertex],
-        "torn": is_torn,
-        "one_face": has_one_face,
-        "many": vertex_value_count > 2,
-        "beside_torn": one_of_two(is_torn),
-        "beside_one_face": one_of_two(has_one_face),
-        "end_of_seam": (vertex_value_count == 1) & ~mesh.is_boundary_vertex[vertex],
-    }
-
-
-def _is_sharpened_by_other(
-    mesh: SharpMesh, seam: NDArray[np.bool_], cut: CutMesh, copies: IntArray
-) -> NDArray[np.bool_]:
-    """Return ``(c,)``: whether each copy is smooth and one of two at its vertex, so that the other copy sharpens it.
-
-    A copy is smooth if no semi-sharp edges are between its faces and its vertex is not semi-sharp.
-    """
-    t, sharpness = mesh.topology, mesh.tags
-    semi_sharp = (sharpness.edges > 0) & ~sharpness.is_infinite & (t.twin >= 0) & ~seam
-    is_sharp = np.bincount(cut.topology.face_vertices, semi_sharp, minlength=len(cut.vertex)) > 0
-    vertex = cut.vertex[copies]
-    is_one_of_two = np.bincount(cut.vertex, minlength=t.vertex_count)[vertex] == 2
-    return is_one_of_two & ~is_sharp[copies] & (sharpness.vertices[vertex] == 0)
+    is_corner = mesh.is_corner[vertex] | is_torn | (mode == "boundaries")
+    if mesh.non_manifold is not None:
+        is_corner |= mesh.non_manifold.is_vertex[vertex]
+    if mode != "none":
+        is_corner |= has_one_face
+    if mode in _CORNERS_PLUS:
+        is_corner |= (vertex_value_count > 2) | one_of_two(is_torn)
+    if mode == "corners_plus2":
+        is_corner |= one_of_two(has_one_face) | ((vertex_value_count == 1) & ~mesh.is_boundary_vertex[vertex])
+    return np.where(is_corner, VertexRule.CORNER, VertexRule.AUTOMATIC).astype(np.int8)[value_of]
