@@ -20,7 +20,8 @@ from scipy.spatial import cKDTree
 from usd import stages
 from usd.stages import CUBE, POLYGONS, SQUARE, bound, camera, material, mesh, moved, prim, shader, subset, texture, told
 
-pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
+# Scalar variants compile nothing: most stages are shown once. Tests of instances and of arrays of rays take LLVM.
+pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 
 # The largest light is 5 units wide at a distance of 7: what its sides send comes from farther away, and at an angle.
 AREA_LIGHT = 0.15
@@ -104,7 +105,7 @@ def test_transforms_are_composed(stage):
 
 
 @pytest.mark.parametrize("interpolation", ["constant", "vertex"])
-def test_instances_look_like_copies(scene, interpolation):
+def test_instances_look_like_copies(scene, interpolation, variant_llvm_ad_rgb):  # noqa: ARG001
     places, size = [(-0.5, 0.2, 0), (0.5, -0.3, 0.4)], (0.3, 0.3, 0.3)
     many = "(1,0,0), (0,1,0), (0,0,1), (1,1,0), (1,0,1), (0,1,1), (1,1,1), (0,0,0)"
     values = many if interpolation == "vertex" else "(1, 0.5, 0)"
@@ -163,8 +164,7 @@ DIFFERENCES = {
 
 
 @pytest.mark.parametrize("difference", DIFFERENCES)
-def test_instances_that_differ_look_like_prims_that_do(scene, difference, request):
-    request.getfixturevalue("variant_scalar_rgb")
+def test_instances_that_differ_look_like_prims_that_do(scene, difference):
     one, two, above = DIFFERENCES[difference]
     paints = {"red": (1, 0, 0), "blue": (0, 0, 1), "green": (0, 1, 0)}
     text = "".join(material(f"color3f inputs:diffuseColor = {color}", name=name) for name, color in paints.items())
@@ -185,12 +185,12 @@ def test_instances_that_differ_look_like_prims_that_do(scene, difference, reques
             instance(name, "/kind", moved(translate=(x, 0, 0)), body, instanceable=kind, apis=apis)
             for name, x, body in (("one", -0.5, one), ("two", 0.5, two))
         ]
-        entries = scene(CAMERA + SKY + text + prim("Xform", "all", above, *both, apis=apis), size=(16, 16))
-        pictures.append(rendered({**entries, **DIRECT}, spp=256))
+        entries = scene(CAMERA + SUN + text + prim("Xform", "all", above, *both, apis=apis), size=(16, 16))
+        pictures.append(rendered({**entries, **DIRECT}, spp=4))
     plain, instanced = pictures
     assert np.abs(plain[:, :8] - plain[:, 8:]).max() > 0.2
-    # Noise of 256 samples of the sky.
-    assert np.abs(plain - instanced).max() < 0.1
+    # Rays meet instances in their own space, which rounds otherwise.
+    assert np.mean(np.abs(plain - instanced) > 1e-3) < 0.01
 
 
 # Of transforms, cameras, lights, materials, shapes without a mesh, subsets and visibility: a value and another one.
@@ -309,7 +309,7 @@ VERTEX_DATA = f"""normal3f[] normals = [(0,0,1), (0,1,0), (1,0,0), (0,0,1), (0,1
     {POLYGONS}"""
 
 
-def test_copies_in_place_of_many_instances_look_like_them(scene, monkeypatch):
+def test_copies_in_place_of_many_instances_look_like_them(scene, monkeypatch, variant_llvm_ad_rgb):  # noqa: ARG001
     """Mirrored ones, with creases, holes and texture coordinates, of limit surfaces and of polygons."""
     content = mesh("smooth", CUBE, TAGS, CORNER_TEXCOORDS) + mesh("flat", CUBE.replace("-1", "-2"), VERTEX_DATA)
     scales = "float3[] scales = [(0.3, 0.3, 0.3), (-0.3, 0.3, 0.3)]"
@@ -343,16 +343,6 @@ def test_subsets_share_the_surface_of_the_whole_mesh(stage, monkeypatch, most_fa
     sixth = whole.face_count() / 6
     assert [part.face_count() for part in parts] == [4 * sixth, 2 * sixth]
     assert ["Principled" in str(part.bsdf()) for part in parts] == [False, True]
-
-
-def test_a_mesh_of_several_materials_is_read_once_for_the_primvars_they_need(stage):
-    names = ["paint_0", "paint_1"]
-    subsets = [subset([number], name, f"part_{number}") for number, name in enumerate(names)]
-    paints = [material(f"color3f inputs:diffuseColor = (1, {k}, 0)", name=name) for k, name in enumerate(names)]
-    shapes = StageReader(stage("".join(paints) + mesh("cube", CUBE, *subsets))).at().shapes
-    plain, *painted = shapes
-    assert painted[0].cage is painted[1].cage is not plain.cage
-    assert [shape.shown_faces.tolist() for shape in shapes] == [[2, 3, 4, 5], [0], [1]]
 
 
 def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(scene):
@@ -656,8 +646,7 @@ def test_normal_maps_turn_the_normal(scene, tmp_path):
 # Radiance of a plane in a white environment of radiance 1, by Cycles of Blender 5.0.1: a Diffuse BSDF of 0.8, and a
 # Principled BSDF of 0.8, metallic, of roughness 0.5. The view is 20 degrees above the plane.
 DOWN, UP, ACROSS = (0.0, -0.6, 0.8), (0.0, 0.6, 0.8), (0.6, 0.0, 0.8)
-OF_CYCLES = {("diffuse", DOWN): 0.659, ("diffuse", UP): 0.659, ("diffuse", ACROSS): 0.659}
-OF_CYCLES |= {("metal", DOWN): 0.772, ("metal", UP): 0.743, ("metal", ACROSS): 0.714}
+OF_CYCLES = {("diffuse", DOWN): 0.659, ("diffuse", ACROSS): 0.659, ("metal", UP): 0.743, ("metal", DOWN): 0.772}
 # Noise of diffuse surfaces. Cycles turns normals of metals towards the viewer, and adds what they scatter between their
 # facets.
 CYCLES_TOLERANCE = {"diffuse": 0.005, "metal": 0.12}
@@ -732,7 +721,7 @@ def test_lights_are_as_large_as_usd_says_and_shine_everywhere(stage, schema, is_
     assert ([(lamp.kind, lamp.size) for lamp in contents.lights], messages) == ([(kind, size)], [])
 
 
-def test_cones_of_spheres_are_spots(scene):
+def test_cones_of_spheres_are_spots(scene, variant_llvm_ad_rgb):  # noqa: ARG001
     """With the softness of USD, of which Mitsuba's ends and middle are the same."""
     spot = light("SphereLight", f"{CONE}40", "float inputs:shaping:cone:softness = 0.5", scale=2)
     with pytest.warns(CageWarning, match=r"sphere lights with a cone have a radius of 0, and sharp shadows \(/lamp\)"):
@@ -792,7 +781,7 @@ def test_lamps_are_clear_where_they_are_in_the_way_of_other_lights(scene, place,
     assert (entries["integrator"]["type"], entries["lamp"].get("bsdf")) == (integrator, bsdf)
 
 
-def test_lights_of_a_studio_are_as_bright_for_a_camera_of_the_stage(scene):
+def test_lights_of_a_studio_are_as_bright_for_a_camera_of_the_stage(scene, variant_llvm_ad_rgb):  # noqa: ARG001
     """There they are far away, where no picture shows them."""
     places = (np.indices((16, 16)).reshape(2, -1) + 0.5) / 16
     middle = dr.zeros(mi.SurfaceInteraction3f)
@@ -897,9 +886,9 @@ def test_the_aperture_fits_the_picture_as_render_settings_say(scene, projection,
     sensor = mi.load_dict(entries["sensor"])
     assert tuple(sensor.film().size()) == (40, 20)
     # Where the corners of the picture are at a distance of the focal length, or in tenths of the world's unit.
-    ray = sensor.sample_ray(0, 0, mi.Point2f([0, 1], [0, 1]), mi.Point2f(0.5))[0]
-    ends = np.array(ray.d * 50 / -ray.d.z if projection == "perspective" else ray.o * 10)[:2]
-    np.testing.assert_allclose(np.abs(np.ptp(ends, axis=1)), [wide, high], rtol=1e-5)
+    rays = [sensor.sample_ray(0, 0, mi.Point2f(corner), mi.Point2f(0.5))[0] for corner in (0, 1)]
+    ends = [np.array(ray.d * 50 / -ray.d.z if projection == "perspective" else ray.o * 10)[:2] for ray in rays]
+    np.testing.assert_allclose(np.abs(np.subtract(*ends)), [wide, high], rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["disableMotionBlur", "instantaneousShutter", "disableDepthOfField"])
@@ -982,17 +971,6 @@ def test_display_colours_of_every_interpolation(scene, scheme):
         np.testing.assert_allclose(picture[6:10, [4, 11]].mean(axis=0), expected, atol=0.07)
 
 
-def test_scalar_variants_make_the_same_picture(scene, request):
-    colors = 'color3f[] primvars:displayColor = [(1,0,0), (0,1,0), (0,0,1), (1,1,0)] (interpolation = "vertex")'
-    text = CAMERA + SUN + mesh("square", SQUARE, colors) + mesh("cube", CUBE.replace("-1", "-0.5"))
-    pictures = []
-    for variant in ("llvm_ad_rgb", "scalar_rgb"):
-        request.getfixturevalue(f"variant_{variant}")
-        pictures.append(rendered({**scene(text, size=(12, 12)), **DIRECT}, spp=4))
-    assert pictures[0].std() > 0.05
-    np.testing.assert_allclose(pictures[0].mean(axis=(0, 1)), pictures[1].mean(axis=(0, 1)), rtol=0.05)
-
-
 def test_normals_of_polygons(scene):
     """Facets, unless normals are authored; those of left-handed meshes stay at their corners."""
     assert not scene(mesh("square", SQUARE))["square"].has_vertex_normals()
@@ -1033,8 +1011,7 @@ def test_shapes_without_a_mesh_have_their_extent_and_face_outwards(stage, kind):
             assert np.einsum("ij,ij->i", p[:, 0], np.cross(p[:, 1], p[:, 2])).sum() > 0
 
 
-def test_the_command_renders_the_whole_file(stage, tmp_path, request):
-    request.getfixturevalue("variant_scalar_rgb")
+def test_the_command_renders_the_whole_file(stage, tmp_path):
     path = stage(CAMERA + DARK + mesh("left", CUBE) + mesh("right", CUBE))
 
     def brightest(*options, status=0):
@@ -1056,7 +1033,7 @@ def test_the_library_prints_nothing_itself_and_messages_of_one_kind_are_one(scen
     for number in range(2):
         (tmp_path / f"{number}.mtlx").write_text("<materialx/>")
     broken = "".join(mesh(f"broken{n}", CUBE.replace("5]", f"{50 + n}]")) for n in range(5))
-    _, messages = told(scene, mesh("seen", CUBE) + documents + broken)
+    _, messages = told(scene, mesh("seen", CUBE) + documents + broken, shading="vertex")
     of_meshes, of_documents = sorted(messages, key=lambda message: "MaterialX" in message)
     assert "prim /broken0: " in of_meshes
     assert of_meshes.endswith("; likewise 4 other prims (/broken1, /broken2, /broken3 and 1 more)")
@@ -1066,7 +1043,6 @@ def test_the_library_prints_nothing_itself_and_messages_of_one_kind_are_one(scen
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
 def test_the_scene_of_the_chess_set_finds_the_set_on_the_search_path(tmp_path):
     from pxr import Ar
 
