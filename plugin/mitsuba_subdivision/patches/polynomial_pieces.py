@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache, partial
-from operator import itemgetter
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from ..evaluation.irregular_patch import IrregularPatch, level_at_size, level_domains, level_rows, rest_rows, transition
 from ..evaluation.patch_tree import PatchTree, patch_trees
 from ..evaluation.polynomials import BernsteinBasis, polynomial_basis, times
-from ..mesh.connectivity import IntArray, Topology
+from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..messages import counted
 from ..schemes.domain import FloatArray, ParameterMap
 from .patch_table import PatchTable
@@ -24,7 +23,6 @@ from .patch_table import PatchTable
 TIP_SIZE = 1 / 64
 # Pieces per run when computing boxes, whose arrays stay in a processor's cache.
 RUN = 1024
-_Any = TypeVar("_Any")
 _Parts = TypeVar("_Parts", bound="PartArrays")
 
 # Halvings of an element, here into 8 by 8 parts, before the coefficients of the parts bound it. A box then exceeds the
@@ -153,9 +151,6 @@ class Tips(PartArrays):
         return times(rest_rows(self.patch), np.abs(times(transition(self.patch, level), coordinates))).max(axis=0).T
 
 
-_Placed = TypeVar("_Placed", PolynomialPieces, Tips)
-
-
 def places_below(
     parts: PolynomialPieces | Tips, domains: Sequence[ParameterMap]
 ) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -191,91 +186,66 @@ class SurfacePieces:
         patches: PatchTable,
         control_points: FloatArray,  # (n_v, 3) float64: at each mesh vertex
     ) -> SurfacePieces:
-        """Divide all elements. Parts of all patches that have equal one-rings are divided together."""
+        """Divide all elements."""
         refined = patches.refined
         table = patches if refined is None else refined.table
         if refined is not None:
             control_points = refined.matrix @ control_points
         form, sizes = polynomial_basis(table.scheme), np.zeros((len(patches.elements.face_sizes), 3))
         trees = patch_trees(table.scheme, [patch_class.signature for patch_class in table.classes])
-        # For each tree, arrays of parts: numbers by which pieces are sorted in the end, in the order of classes and
-        # children; places as in `PolynomialPieces`; control points of the one-rings.
-        parts: list[tuple[PatchTree, tuple[NDArray, ...]]] = []
-        for number, (patch_class, tree) in enumerate(zip(table.classes, trees, strict=True)):
+        regular, tips, known = [], dict[IrregularPatch, list[Tips]](), dict[PatchTree, FloatArray]()
+        for patch_class, tree in counted(list(zip(table.classes, trees, strict=True)), "Pieces of patch classes"):
             controls = control_points[patch_class.controls]
             corners = patch_class.corners if refined is None else refined.corners(patch_class)
             np.maximum.at(sizes, patches.elements.face[corners], np.abs(controls).max(axis=1))
-            # A patch of the refined cage is a quarter of a whole element of the cage.
-            is_quarter = patches.is_whole[patches.elements.face[corners]] & (refined is not None)
-            matrices = np.where(is_quarter, 0.5, 1.0)[:, None, None] * np.eye(2)
-            order, offsets = np.full(len(corners), float(number)), np.zeros((len(corners), 2))
-            parts.append((tree, (order, corners.astype(np.int64), matrices, offsets, controls)))
-        empty = [np.empty((0, *shape)) for shape in ((2, 2), (2,), (3,), (len(form.bernstein.indices), 3))]
-        regular = [(np.empty(0), PolynomialPieces(form.bernstein, np.empty(0, dtype=np.int64), *empty))]
-        tips, child_order = [], 1.0
-        while parts:
-            children: list[tuple[PatchTree, tuple[NDArray, ...]]] = []
-            child_order /= 4
-            for group in counted(alike(parts, itemgetter(0)), "Parts of patches"):
-                tree, columns = group[0][0], zip(*(arrays for _, arrays in group), strict=True)
-                order, half_edge, matrices, offsets, controls = map(np.concatenate, columns)
-                domains = tree.domains if tree.piece is None else [tree.piece.domain]
-                places = [
-                    (half_edge, matrices @ outward.matrix, matrices @ outward.offset + offsets)
-                    for outward in (domain.inverse() for domain in domains)
-                ]
-                if tree.piece is None:
-                    for number, ((child, stencils), place) in enumerate(zip(tree.children, places, strict=True)):
-                        children.append((child, (order + number * child_order, *place, stencils @ controls)))
-                elif tree.piece.patch is not None:
-                    coordinates = tree.piece.coordinates @ controls
-                    tips.append((order, Tips(tree.piece.patch, *places[0], coordinates)))
-                else:
-                    origins, rows = controls[:, 0], form.of_controls @ tree.piece.stencils
-                    coefficients = rows @ (controls - origins[:, None])
-                    regular.append((order, PolynomialPieces(form.bernstein, *places[0], origins, coefficients)))
-            parts = children
-        joined = [_sorted(group) for group in alike(tips, lambda pair: pair[1].patch)]
-        joined.sort(key=lambda pair: pair[0][0])
-        all_tips = tuple(_from_nearest_corner(patches, part, part.offsets) for _, part in joined)
-        _, pieces = _sorted(regular)
-        return cls(_from_nearest_corner(patches, pieces, pieces.middles()[2]), all_tips, sizes)
+            half_edge, matrices, offsets = _places(patches, corners, tree)
+            rows = tree.coefficients(form.of_controls, known)
+            count, coefficients = len(rows), rows[:, None] @ (controls - controls[:, :1])
+            regular.append(
+                PolynomialPieces(
+                    form.bernstein,
+                    half_edge[:count].ravel(),
+                    matrices[:count].reshape(-1, 2, 2),
+                    offsets[:count].reshape(-1, 2),
+                    np.tile(controls[:, 0], (count, 1)),
+                    coefficients.reshape(-1, *coefficients.shape[2:]),
+                )
+            )
+            for number, tip in enumerate(tree.tips, count):
+                place = half_edge[number], matrices[number], offsets[number]
+                part = Tips(tip.irregular_patch, *place, tip.coordinates @ controls)
+                tips.setdefault(part.patch, []).append(part)
+        return cls(PolynomialPieces.joined(regular), tuple(Tips.joined(alike) for alike in tips.values()), sizes)
 
 
-def _sorted(pairs: Sequence[tuple[FloatArray, _Parts]]) -> tuple[FloatArray, _Parts]:
-    """Join parts, and sort them by the numbers that come with them."""
-    numbers, parts = zip(*pairs, strict=True)
-    order = np.concatenate(numbers)
-    sort = np.argsort(order, kind="stable")
-    return order[sort], type(parts[0]).joined(parts).chosen(sort)
-
-
-def alike(parts: Iterable[_Any], key: Callable[[_Any], object]) -> list[list[_Any]]:
-    """Group parts by their keys, in the order in which the keys first appear."""
-    groups: dict[object, list[_Any]] = {}
-    for part in parts:
-        groups.setdefault(key(part), []).append(part)
-    return list(groups.values())
-
-
-def _from_nearest_corner(
+def _places(
     patches: PatchTable,
-    parts: _Placed,
-    near_uv: FloatArray,  # (n, 2) float64: parameters in the element of a point whose nearest corner is chosen
-) -> _Placed:
-    """Let parameters in whole elements start at the nearest corner, so that they lose no digits there."""
-    if patches.refined is not None or not len(parts):
-        return parts
+    corners: IndexArray,  # (p,) int32: the corner of the element at which each patch begins
+    tree: PatchTree,  # Of the patches
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """``half_edge``, ``matrices`` and ``offsets`` of all patches' regular pieces and tips: ``(r + t, p, ...)``.
+
+    In whole elements, parameters start at the corner nearest to the middle of the piece, or to the extraordinary point,
+    so that they lose no digits there.
+    """
     domain, elements = patches.scheme.domain, patches.elements
-    half_edge, matrices, offsets = parts.half_edge, parts.matrices.copy(), parts.offsets.copy()
-    turns = [domain.rotation(turn).inverse() for turn in range(domain.corner_count)]
-    turn = np.argmin([domain.extent(turned(near_uv)) for turned in turns], axis=0)
-    turn[~patches.is_whole[elements.face[half_edge]]] = 0
-    for number in range(1, domain.corner_count):
-        half_edge = np.where(turn >= number, elements.next[half_edge], half_edge)
-        at, turned = turn == number, turns[number]
-        matrices[at], offsets[at] = turned.matrix @ matrices[at], turned(offsets[at])
-    return replace(parts, half_edge=half_edge, matrices=matrices, offsets=offsets)
+    (matrices, offsets), of_tips = tree.regular_domains, [tip.domain.inverse() for tip in tree.tips]
+    near_uv = np.concatenate([matrices @ domain.centre + offsets, *(of_tip.offset[None] for of_tip in of_tips)])
+    matrices = np.concatenate([matrices, *(of_tip.matrix[None] for of_tip in of_tips)])
+    offsets = np.concatenate([offsets, near_uv[len(offsets) :]])
+    is_whole, half_edge = patches.is_whole[elements.face[corners]], corners[None].astype(np.int64)
+    scale, turn = np.ones(len(corners)), np.zeros(len(matrices), dtype=np.int64)
+    if patches.refined is not None:
+        # A patch of the refined cage is a quarter of a whole element of the cage.
+        scale[is_whole] = 0.5
+    elif is_whole.all():
+        turns = [domain.rotation(turn).inverse() for turn in range(domain.corner_count)]
+        turn = np.argmin([domain.extent(turned(near_uv)) for turned in turns], axis=0)
+        for _ in turns[1:]:
+            half_edge = np.concatenate([half_edge, elements.next[half_edge[-1:]]])
+        to_corner, starts = (np.array(part)[turn] for part in zip(*turns, strict=True))
+        matrices, offsets = to_corner @ matrices, (to_corner @ offsets[:, :, None])[:, :, 0] + starts
+    return half_edge[turn], scale[:, None, None] * matrices[:, None], scale[:, None] * offsets[:, None]
 
 
 @dataclass(frozen=True, eq=False)
