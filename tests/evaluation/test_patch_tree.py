@@ -7,7 +7,7 @@ from kernels.surfaces import RING, SURFACES, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.evaluation.element import element_stencils
-from mitsuba_subdivision.evaluation.irregular_patch import level_domains, level_rows, rest_rows, transition
+from mitsuba_subdivision.evaluation.irregular_patch import level_domains, level_rows, rest_rows
 from mitsuba_subdivision.evaluation.patch_tree import PartKind, patch_tree, patch_trees, whole_piece
 from mitsuba_subdivision.evaluation.refined_rings import refined_ring
 from mitsuba_subdivision.patches import PatchTable
@@ -130,7 +130,7 @@ def test_levels_and_the_rest_cover_a_tip_and_bounds_of_the_rest_contain_all_late
         assert sum(area(each) for level in range(4) for each in level_domains(tip.patch, level)) == 1 - 4.0**-4
         coordinates = tip.coordinates @ np_rng.normal(size=(tip.coordinates.shape[1], 3))
         for level in (0, 1, 4):
-            reach = (rest_rows(tip.patch) @ np.abs(transition(tip.patch, level) @ coordinates)).max(axis=0)
+            reach = (rest_rows(tip.patch) @ np.abs(tip.patch.basis.block_matrix(level) @ coordinates)).max(axis=0)
             for later in range(level, level + 12):
                 away = np.abs(level_rows(tip.patch, later) @ coordinates - coordinates[0])
                 assert (away <= ROUNDED * reach).all()

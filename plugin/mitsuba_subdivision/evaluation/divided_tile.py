@@ -19,7 +19,7 @@ from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
-from .irregular_patch import IrregularPatch, level_rows, rest_rows, transition
+from .irregular_patch import IrregularPatch, level_rows, rest_rows
 from .patch_tree import PartKind, PatchTree
 from .polynomials import polynomial_basis, times
 
@@ -64,7 +64,7 @@ class DividedTile:
         if isinstance(source, PatchTree):
             return tuple(part_of_tile(child, stencils) for child, stencils in source.children)
         # The same tile at the next level, and three pieces.
-        parts = [(self, transition(source, 1))]
+        parts = [(self, source.basis.block_matrix())]
         parts += [(_tile(scheme, None, 0), _turned(scheme, turn) @ rows) for rows in level_rows(source, 0)]
         return tuple(parts[number] for number in _children_before_turn(scheme.domain, turn))
 

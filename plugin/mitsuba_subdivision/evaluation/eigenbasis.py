@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +24,6 @@ INVERSE_ITERATIONS = 25
 CONTRACTION = 1e-9
 # Power of the matrix with which `_require_basis` checks a basis.
 POWER = 20
-# Powers of a nilpotent matrix with entries below this are treated as zero.
-NILPOTENT = 1e-13
-# Maximum number of powers of a nilpotent part. If none of them is zero, the block has complex eigenvalues.
-LONGEST_CHAIN = 4
 
 
 class EigenbasisError(ArithmeticError):
@@ -94,11 +89,7 @@ def eigenbasis(
         raise EigenbasisError(f"the second eigenvalue has modulus {second:.6g}; expected below 1, or there is no limit")
     clusters = _clusters(eigenvalues)
     try:
-        bases = [
-            _cluster_basis(matrix, eigenvalues, members, left, singular)
-            for members, (left, singular) in zip(clusters, _spans(eigenvectors, clusters), strict=True)
-        ]
-        vectors = np.hstack(bases)
+        vectors = np.hstack([_subspace(matrix, eigenvalues, eigenvectors, members) for members in clusters])
         vectors[:, 0] = 1
         inverse = np.linalg.inv(vectors)
     except np.linalg.LinAlgError as error:
@@ -106,20 +97,17 @@ def eigenbasis(
             f"eigenbasis of a {size} x {size} subdivision matrix: eigenvectors are dependent, the closest eigenvalues "
             f"are {_closest(eigenvalues, clusters)}; expected equal ones, within {CLUSTER_WIDTH:.0e}, or distant ones"
         ) from error
-    centres = [eigenvalues[members].real.mean() for members in clusters]
-    moduli = [np.full(len(members), np.abs(eigenvalues[members]).max()) for members in clusters]
-    transformed = inverse @ matrix @ vectors
-
-    means, blocks, begin = np.empty(size), [], 0
-    for cluster_basis, centre in zip(bases, centres, strict=True):
-        block_slice = slice(begin, begin + cluster_basis.shape[1])
+    transformed, blocks, end = inverse @ matrix @ vectors, [], 0
+    means, moduli = np.empty((2, size))
+    for members in clusters:
+        begin, end = end, end + len(members)
+        block_slice, cluster = slice(begin, end), eigenvalues[members]
+        means[block_slice], moduli[block_slice] = cluster.real.mean(), np.abs(cluster).max()
         block = transformed[block_slice, block_slice]
-        means[block_slice] = centre
-        if np.abs(block - centre * np.eye(len(block))).max() >= DIAGONAL:
+        if np.abs(block - means[begin] * np.eye(len(block))).max() >= DIAGONAL:
             blocks.append((block_slice, block))
-        begin = block_slice.stop
     means[0] = 1
-    basis = Eigenbasis(vectors, inverse, means, np.concatenate(moduli), tuple(blocks))
+    basis = Eigenbasis(vectors, inverse, means, moduli, tuple(blocks))
     _require_basis(matrix, basis)
     return basis
 
@@ -142,39 +130,6 @@ def _require_basis(matrix: FloatArray, basis: Eigenbasis) -> None:
             )
 
 
-def times_block_powers(
-    rows: NDArray,  # (d, s, m) float: their precision is the precision of the product
-    levels: NDArray[np.int64],  # (s,) int64
-    block: FloatArray,  # (m, m) float64
-    mean: float,  # Mean of the block's eigenvalues
-) -> NDArray:
-    """Multiply each row by a power of a block of T: ``rows[.., s, :] @ block^levels[s]``.
-
-    A Jordan block is ``mean`` times the identity plus a nilpotent matrix Z. In the blocks of two rows that subdivision
-    matrices have, ``Z^2 = 0``, so ``(mean + Z)^n`` is a short sum. Blocks of complex eigenvalues have no nilpotent
-    part; their powers are computed for each level.
-    """
-    real = rows.dtype.type
-    nilpotent = block - mean * np.eye(len(block))
-    chain = [nilpotent]
-    while np.abs(chain[-1]).max() > NILPOTENT and len(chain) <= LONGEST_CHAIN:
-        chain.append(chain[-1] @ nilpotent)
-    if len(chain) > LONGEST_CHAIN:
-        product = np.empty_like(rows)
-        for level in np.unique(levels):
-            at_level = np.flatnonzero(levels == level)
-            product[:, at_level] = rows[:, at_level] @ np.linalg.matrix_power(block, int(level)).astype(real)
-        return product
-    # The sum over k of binomial(n, k) mean^(n - k) Z^k.
-    product = rows * (real(mean) ** levels.astype(real))[:, None]
-    binomial = np.ones(len(levels))
-    for order, power in enumerate(chain[:-1], start=1):
-        binomial *= (levels - order + 1) / order
-        weight = binomial * np.where(levels >= order, mean ** np.maximum(levels - order, 0.0), 0)
-        product += rows @ power.astype(real) * weight.astype(real)[:, None]
-    return product
-
-
 def _clusters(eigenvalues: NDArray[np.complex128]) -> list[NDArray[np.int64]]:
     """Return indices of equal or conjugate eigenvalues for each cluster, by decreasing modulus.
 
@@ -190,21 +145,6 @@ def _clusters(eigenvalues: NDArray[np.complex128]) -> list[NDArray[np.int64]]:
     return clusters
 
 
-def _spans(
-    eigenvectors: NDArray[np.complex128], clusters: list[NDArray[np.int64]]
-) -> list[tuple[FloatArray, FloatArray]]:
-    """Return left singular vectors and singular values of each cluster's eigenvectors, real and imaginary parts."""
-    spans: list[Any] = [None] * len(clusters)
-    # Clusters of the same size are decomposed in one call.
-    for size in {len(members) for members in clusters}:
-        same_size = [number for number, members in enumerate(clusters) if len(members) == size]
-        vectors = eigenvectors[:, [clusters[number] for number in same_size]].transpose(1, 0, 2)
-        left, singular, _ = np.linalg.svd(np.concatenate([vectors.real, vectors.imag], axis=2), full_matrices=False)
-        for index, number in enumerate(same_size):
-            spans[number] = left[index], singular[index]
-    return spans
-
-
 def _closest(eigenvalues: NDArray[np.complex128], clusters: list[NDArray[np.int64]]) -> str:
     """Format the two closest eigenvalues of different clusters."""
     cluster_of = np.empty(len(eigenvalues), dtype=np.int64)
@@ -216,26 +156,26 @@ def _closest(eigenvalues: NDArray[np.complex128], clusters: list[NDArray[np.int6
     return f"{first:.9g} and {second:.9g}"
 
 
-def _cluster_basis(
+def _subspace(
     matrix: FloatArray,
     eigenvalues: NDArray[np.complex128],
-    members: NDArray[np.int64],
-    left: FloatArray,
-    singular: FloatArray,
+    eigenvectors: NDArray[np.complex128],
+    members: NDArray[np.int64],  # Indices of the eigenvalues of a cluster
 ) -> FloatArray:
-    """Return an orthonormal basis of the invariant subspace of a cluster of eigenvalues."""
-    cluster, span = eigenvalues[members], left[:, : len(members)]
-    if singular[len(members) - 1] >= DEPENDENT:
-        return span
-    gap = np.abs(np.delete(eigenvalues, members)[:, None] - cluster).min()
-    return _invariant_subspace(matrix, cluster.real.mean() + 0.1 * gap, span)
+    """Return an orthonormal basis of the invariant subspace of a cluster of eigenvalues.
 
-
-def _invariant_subspace(matrix: FloatArray, shift: float, start: FloatArray) -> FloatArray:
-    """Compute an orthonormal basis of the generalised eigenspace nearest to ``shift``, by block inverse iteration."""
+    Where the eigenvectors are dependent, it is computed by block inverse iteration.
+    """
+    vectors, count = eigenvectors[:, members], len(members)
+    left, singular, _ = np.linalg.svd(np.hstack([vectors.real, vectors.imag]), full_matrices=False)
+    block: FloatArray = left[:, :count]
+    if singular[count - 1] >= DEPENDENT:
+        return block
+    gap = np.abs(np.delete(eigenvalues, members)[:, None] - eigenvalues[members]).min()
+    shift = eigenvalues[members].real.mean() + 0.1 * gap
     solve = np.linalg.inv(matrix - shift * np.eye(len(matrix)))
     # Dependent start vectors do not span the subspace, so noise is added.
-    block = start + 0.1 * np.random.default_rng(0).standard_normal(start.shape)
+    block = block + 0.1 * np.random.default_rng(0).standard_normal(block.shape)
     for _ in range(INVERSE_ITERATIONS):
         block, _ = np.linalg.qr(solve @ block)
     return block

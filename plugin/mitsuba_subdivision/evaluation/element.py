@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..mesh.connectivity import IntArray, Topology
+from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Signature
 from ..schemes import SchemeError, scheme_named
@@ -183,15 +183,18 @@ def _curvature(
     """Return ``(2, s)`` Gaussian and mean curvature, from ``values`` ``(6, 3, s)`` by the parameters of leaves."""
     derivatives = values[1:].swapaxes(1, 2)
     curvatures = curvature(derivatives[:2], derivatives[2:])
-    for leaves in located.leaves if evaluator == "stabilized" else ():
-        if leaves.patch is None:
-            continue
-        which = np.flatnonzero(located.is_in(leaves))
-        samples, size = located.chosen(which), len(leaves.patch.basis.eigenvalues)
-        unit_rows = np.repeat(np.eye(size)[:, None], len(which), axis=1)
-        weights, near = samples.weights([unit_rows]), _chosen(points, located, which)
-        coordinates = np.concatenate([w.astype(p.dtype, copy=False) @ p for w, p in zip(weights, near, strict=True)])
-        curvatures[:, which] = irregular_curvature(leaves.patch, samples.leaf_uv, coordinates, np.arange(len(which)))
+    if evaluator != "stabilized":
+        return curvatures
+    index = located.per_sample([np.full(len(leaves.uv), number) for number, leaves in enumerate(located.leaves)])
+    uv = located.per_sample([leaves.uv.T for leaves in located.leaves]).T
+    for number, leaves in enumerate(located.leaves):
+        if leaves.patch is not None:
+            which = np.flatnonzero(index == number)
+            unit_rows = np.repeat(np.eye(len(leaves.patch.basis.eigenvalues))[:, None], len(which), axis=1)
+            weights = located.chosen(which).weights([unit_rows])
+            pairs = zip(weights, _chosen(points, located, which), strict=True)
+            coordinates = np.concatenate([w.astype(p.dtype, copy=False) @ p for w, p in pairs])
+            curvatures[:, which] = irregular_curvature(leaves.patch, uv[which], coordinates)
     return curvatures
 
 
@@ -226,8 +229,7 @@ def curvature(
 def irregular_curvature(
     patch: IrregularPatch,
     uv: FloatArray,  # (s, 2) float64: parameters in the patch
-    coordinates: FloatArray,  # (e, K, 3): eigen-coordinates of each element
-    which: IntArray,  # (s,) int64: element of each sample
+    coordinates: FloatArray,  # (s, K, 3): eigen-coordinates of each sample's element
 ) -> FloatArray:
     """Compute curvatures in an irregular patch, in the frame of its limit normal.
 
@@ -246,8 +248,8 @@ def irregular_curvature(
 
     in_plane = times_powers(rows, level, patch.basis, largest)
     heights = times_powers(rows, level, patch.basis, second_largest)
-    x, y = (np.einsum("dsk,sk->ds", in_plane, local[which, :, axis]) for axis in (0, 1))
-    z = np.einsum("dsk,sk->ds", heights, local[which, :, 2])
+    x, y = (np.einsum("dsk,sk->ds", in_plane, local[:, :, axis]) for axis in (0, 1))
+    z = np.einsum("dsk,sk->ds", heights, local[:, :, 2])
 
     growth = second_largest / largest**2
     real = coordinates.dtype.type
@@ -324,28 +326,19 @@ def limit_stencil(scheme: str, valence: int) -> LimitStencil:
     if valence < 3:
         raise SchemeError(f"limit stencil of valence {valence}: expected 3 or more")
     signature = isolated_signature(rules, valence)
-    topology = one_ring(signature).topology
+    ring = one_ring(signature)
+    t = ring.topology
     if rules.element == "face":
-        slots, ring = _vertex_ring(topology, valence)
+        ahead = t.next[ring.around[0]]
+        edge_ring, face_ring = t.face_vertices[ahead], t.face_vertices[t.next[ahead]]
+        slots = np.concatenate([[0], edge_ring, face_ring[: valence * (rules.regular_face_size > 3)]])
     else:
-        slots = ring = topology.face_vertices[:valence].tolist()
+        slots = edge_ring = t.face_vertices[:valence]
     basis = eigenbasis(refined_children(rules, signature)[0][2])
 
     angles = 2 * np.pi * np.arange(valence) / valence
     target = np.stack([np.cos(angles), np.sin(angles)])
     plane = basis.inverse[1:3]
     # The eigenvectors span the plane of the first Fourier mode. Choose the pair that is cosine and sine on the ring.
-    combination = target @ plane[:, ring].T @ np.linalg.inv(plane[:, ring] @ plane[:, ring].T)
+    combination = target @ plane[:, edge_ring].T @ np.linalg.inv(plane[:, edge_ring] @ plane[:, edge_ring].T)
     return LimitStencil(basis.inverse[0, slots], (combination @ plane)[:, slots])
-
-
-def _vertex_ring(topology: Topology, valence: int) -> tuple[list[int], list[int]]:
-    """Return the vertices of a limit stencil at vertex 0 of a one-ring, and the edge ring among them."""
-    half_edge, edge_ring, face_ring = 0, [], []
-    for _ in range(valence):
-        ahead = topology.next[half_edge]
-        edge_ring.append(int(topology.face_vertices[ahead]))
-        if topology.face_sizes[0] > 3:
-            face_ring.append(int(topology.face_vertices[topology.next[ahead]]))
-        half_edge = int(topology.turn[half_edge])
-    return [0, *edge_ring, *face_ring], edge_ring

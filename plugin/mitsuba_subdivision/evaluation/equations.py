@@ -75,7 +75,7 @@ from numpy.typing import NDArray
 
 from ..schemes.domain import FloatArray, ParameterDomain
 from ..schemes.scheme import Scheme
-from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, times_block_powers
+from .eigenbasis import CLUSTER_WIDTH, Eigenbasis
 
 # The equations: (4); (9) and (11); (10) and (12), with (13) at the extraordinary point; (13) everywhere.
 Evaluator = Literal["power", "stam", "stabilized", "limit"]
@@ -240,9 +240,12 @@ def times_powers(
     scaled = rows * powers.take(which, axis=0)
     scaled[:, :, ~kept] = 0
     for block_slice, block in basis.blocks:
-        if kept[block_slice].all():
-            mean = basis.eigenvalues[block_slice][0] / base
-            scaled[:, :, block_slice] = times_block_powers(rows[:, :, block_slice], level, block / base, mean)
+        if not kept[block_slice].all():
+            continue
+        for index, n in enumerate(occurring.tolist()):
+            at_level = np.flatnonzero(which == index)
+            power = np.linalg.matrix_power(block / base, n).astype(real)
+            scaled[:, at_level, block_slice] = rows[:, at_level, block_slice] @ power
     return scaled
 
 

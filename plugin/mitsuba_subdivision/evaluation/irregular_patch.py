@@ -121,41 +121,26 @@ class IrregularPatch:
 
         At the extraordinary point itself, (4), (9) and second derivatives are undefined: NaN.
         """
-        if evaluator == "limit":
-            return self._rows_at_point(len(uv), dtype, derivatives)
         tables = self.children if evaluator == "power" else self.eigen_children
         level, rows = child_rows(self.scheme, uv, tables.astype(dtype, copy=False), derivatives)
-        at_point = self.scheme.domain.extent(uv) == 0
+        at_point = (self.scheme.domain.extent(uv) == 0) | (evaluator == "limit")
+        scale, frame = np.ones((2, len(uv)), dtype=dtype), None
         # At levels beyond the resolution of their precision, the published forms and the derivative scale overflow.
         with np.errstate(over="ignore", invalid="ignore"):
-            if evaluator == "stabilized":
-                return self._stabilized(rows, level, at_point, derivatives)
-            rows = stam_rows(rows, level, self.basis) if evaluator == "stam" else power_rows(rows, level, self.matrix)
-        rows[:, at_point] = np.nan
-        scale = np.ones((2, len(uv)), dtype=dtype)
-        return SampleRows(rows, scale, np.where(at_point, AT_EXTRAORDINARY_POINT, level))
-
-    def _stabilized(
-        self, at_level_0: FloatArray, level: NDArray[np.int64], at_point: NDArray[np.bool_], derivatives: int
-    ) -> SampleRows:
-        """Apply (10) and (12), or (13) at the extraordinary point, to `child_rows` ``at_level_0``."""
-        limit = self._rows_at_point(1, at_level_0.dtype, derivatives)
-        rows, scale = stabilized_rows(at_level_0, level, self.basis)
-        frame = None
-        if limit.frame is not None:
-            frame = uneven_frame(at_level_0[1:3], level, self.basis) if self.contracts_unevenly else rows[1:3].copy()
-            frame[:, at_point] = limit.frame
-        rows[:, at_point] = limit.rows
-        scale[:, at_point] = 1
+            if evaluator == "power":
+                rows = power_rows(rows, level, self.matrix)
+            elif evaluator == "stam":
+                rows = stam_rows(rows, level, self.basis)
+            else:
+                uneven = uneven_frame(rows[1:3], level, self.basis) if self.contracts_unevenly else None
+                rows, scale = stabilized_rows(rows, level, self.basis)
+                if self.has_own_frame:
+                    frame = rows[1:3].copy() if uneven is None else uneven
+                    frame[:, at_point] = self.limit_frame[:, None]
+        rows[:, at_point], scale[:, at_point] = np.nan, 1
+        if evaluator in ("stabilized", "limit"):
+            rows[0, at_point], rows[1:3, at_point] = limit_rows(rows.shape[2])[0], self.edge_tangents[:, None]
         return SampleRows(rows, scale, np.where(at_point, AT_EXTRAORDINARY_POINT, level), frame)
-
-    def _rows_at_point(self, count: int, dtype: DTypeLike, derivatives: int) -> SampleRows:
-        """Apply equation (13), which is the same for every sample."""
-        rows = np.full(((3, 6)[derivatives - 1], count, len(self.basis.eigenvalues)), np.nan, dtype=dtype)
-        rows[0] = limit_rows(len(self.basis.eigenvalues))[0]
-        rows[1:3] = self.edge_tangents[:, None, :]
-        frame = np.repeat(self.limit_frame[:, None, :], count, axis=1).astype(dtype) if self.has_own_frame else None
-        return SampleRows(rows, np.ones((2, count), dtype=dtype), np.full(count, AT_EXTRAORDINARY_POINT), frame)
 
 
 def level_polynomials(patch: IrregularPatch, form: FloatArray, levels: NDArray[np.int64]) -> FloatArray:
@@ -195,29 +180,20 @@ def float32_levels(patch: IrregularPatch) -> int:
     return int(np.ceil(np.log(FLOAT32_SIZE) / np.log(max(0.5, patch.basis.subdominant))))
 
 
-def transition(patch: IrregularPatch, level: int) -> FloatArray:
-    """Return ``Tⁿ``, ``(K, K)``: maps eigen-coordinates to those of child 0 after ``level`` refinements."""
-    return np.linalg.matrix_power(patch.basis.block_matrix(), level)
-
-
 @lru_cache(maxsize=1024)
 def rest_rows(patch: IrregularPatch) -> FloatArray:
     """Return a bound of the distance from the extraordinary point to the surface at a level and all later ones.
 
-    Returns
-    -------
-    (r, K) float64, read-only
-        To be multiplied by the absolute eigen-coordinates of the level, see `transition`. The largest of the r sums is
-        the bound. A weaker bound is the one sum with the largest entry of each column.
+    Returns ``(r, K)``, read-only, to be multiplied by the absolute eigen-coordinates of the level, which
+    are ``Tⁿ`` times those of the patch. The largest of the r sums is the bound. A weaker bound is the one sum with the
+    largest entry of each column.
 
-    Notes
-    -----
     The point is ``ĉ_1``, and the pieces of level n have the Bernstein coefficients ``Φ Tⁿ ĉ``. So along any axis, all
     pieces of level n and later are within ``max_k Σ_{i ≥ 2} |φ_ki| |Tⁿ ĉ|_i`` of the point, where ``φ_ki`` is the
     largest entry of ``Φ Tʲ`` for any j. It is the entry for j = 0, except in Jordan blocks, whose powers grow before
     they shrink.
     """
-    rows, step = level_rows(patch, 0).reshape(-1, len(patch.basis.eigenvalues)), transition(patch, 1)
+    rows, step = level_rows(patch, 0).reshape(-1, len(patch.basis.eigenvalues)), patch.basis.block_matrix()
     bound = np.abs(rows)
     for _ in range(GROWING_LEVELS):
         rows = rows @ step

@@ -59,7 +59,6 @@ class Leaves:
     uv: FloatArray  # (n, 2) parameters in the leaf
     # For each leaf: its depth, its index among the nodes of this depth, its piece, and its slice of `uv`
     parts: list[tuple[int, int, Piece, slice]]
-    begin: int  # Number of the first sample, counted over all `Leaves`
 
     def rows(self, scheme: Scheme, evaluator: Evaluator, dtype: DTypeLike, derivatives: int) -> SampleRows:
         """Return rows over the eigen-coordinates; for regular patches and "power", over the control points."""
@@ -145,7 +144,7 @@ class LocatedSamples:
             self.leaf_sample[in_patch] = np.arange(begin, begin + len(in_patch))
             ends = np.cumsum([len(in_tree) for *_, in_tree in rows]).tolist()
             parts = [(*row[:3], slice(end - len(row[3]), end)) for row, end in zip(rows, ends, strict=True)]
-            self.leaves.append(Leaves(patch, uv[in_patch], parts, begin))
+            self.leaves.append(Leaves(patch, uv[in_patch], parts))
             begin += len(in_patch)
         rotations = np.stack([domain.rotation(turn).matrix for turn in range(domain.corner_count)], axis=-1)
         self.jacobian: FloatArray = rotations.take(leaf_turn, axis=-1) * speed
@@ -200,15 +199,6 @@ class LocatedSamples:
     def per_sample(self, of_leaves: Sequence[NDArray[Any]]) -> NDArray[Any]:
         """Reorder values ``(.., n)`` of the samples of each of the `leaves` to ``(.., s)``, the order of samples."""
         return np.concatenate(of_leaves, axis=-1)[..., self.leaf_sample]
-
-    def is_in(self, leaves: Leaves) -> NDArray[np.bool_]:
-        """Return ``(s,)``: whether samples lie in these leaves."""
-        return (self.leaf_sample >= leaves.begin) & (self.leaf_sample < leaves.begin + len(leaves.uv))
-
-    @property
-    def leaf_uv(self) -> FloatArray:
-        """``(s, 2)`` parameters in the leaves."""
-        return np.concatenate([leaves.uv for leaves in self.leaves])[self.leaf_sample]
 
     def slices(self) -> Iterator[slice]:
         """Return the samples of each element."""

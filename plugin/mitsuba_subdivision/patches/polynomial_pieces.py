@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..evaluation.irregular_patch import IrregularPatch, level_at_size, level_domains, level_rows, rest_rows, transition
+from ..evaluation.irregular_patch import IrregularPatch, level_at_size, level_domains, level_rows, rest_rows
 from ..evaluation.patch_tree import PatchTree, patch_trees
 from ..evaluation.polynomials import BernsteinBasis, polynomial_basis, times
 from ..mesh.connectivity import IndexArray, IntArray, Topology
@@ -148,7 +148,9 @@ class Tips(PartArrays):
     def reach(self, level: int) -> FloatArray:
         """``(t, 3)`` bounds along the axes of the distance from the point to the surface at this and deeper levels."""
         coordinates = np.ascontiguousarray(self.coordinates.transpose(1, 2, 0))
-        return times(rest_rows(self.patch), np.abs(times(transition(self.patch, level), coordinates))).max(axis=0).T
+        return (
+            times(rest_rows(self.patch), np.abs(times(self.patch.basis.block_matrix(level), coordinates))).max(axis=0).T
+        )
 
 
 def places_below(
