@@ -603,7 +603,11 @@ IGNORED_INPUTS = [
     ("string inputs:varname", "float2 inputs:fallback = (1, 0)\n...", "fallback of texture coord"),
     ("string inputs:varname", "int inputs:index = 1\n...", "ignored (index of /paint/reader)"),
     ("reader.outputs:result>", "place.outputs:result>", "ignored (pivot of /paint/place)"),
-    ("reader.outputs:result>", "odd.outputs:result>", 'shaders "Odd" of texture coordinates are ignored (/paint/odd)'),
+    (
+        "reader.outputs:result>",
+        "odd.outputs:result>",
+        'shaders "Odd" are ignored, and defaults are used; expected UsdUVT',
+    ),
     ("outputs:rgb", "outputs:rgba", 'the output "rgba" of textures is not there; rgb is used'),
     ("outputs:rgb>", "outputs:none>", "connections of inputs to what is not there are ignored (/paint/surface.inputs"),
     (RGB, "float2 inputs:scale = (1, 1)\n...", "materials whose inputs have other types than their model"),
