@@ -36,18 +36,30 @@ def adaptive_table(
     # (n, 3) float64: control points at which the criterion holds. The table can be applied to others.
     control_points: FloatArray,
     criterion: Criterion,
-    max_rate: int,  # Most segments along an edge of the cage, 1 to `HIGHEST_RATE`; see `choose_tiles`
+    # Most segments along an edge of the cage, and along each ring around an extraordinary point, 1 to `HIGHEST_RATE`;
+    # rounded down to a power of two
+    max_rate: int,
     cage_name: str,  # For warnings
 ) -> VertexTable:
-    """Prepare the adaptive tessellation of a cage's patches.
+    """Prepare the adaptive tessellation of a cage's patches, divided into tiles in the order of the elements.
 
-    Raises ValueError if ``max_rate`` is out of range. Raises MemoryError, and warns, as `choose_tiles` does.
+    Raises ValueError if ``max_rate`` is out of range. Raises MemoryError if the triangles would not fit into memory.
+    Warns if ``max_rate`` is too low for the criterion, unless that is for outlines.
     """
     max_rate = checked_rate(max_rate, "max_rate")
     if max_rate > HIGHEST_RATE:
         raise ValueError(f"max_rate {max_rate}; expected at most {HIGHEST_RATE} segments per edge")
-    frames = PatchFrames.of(patches, control_of_vertex)
-    tiles = choose_tiles(patches, frames, control_points, control_of_vertex, criterion, max_rate, cage_name)
+    frames, points = PatchFrames.of(patches, control_of_vertex), control_points[control_of_vertex]
+    rates = TileRates(patches.scheme, frames, criterion, max_rate)
+    features = feature_edges(patches, frames, points, criterion)
+    none = np.empty(0, dtype=tile_type(patches.scheme.domain.corner_count))
+    needed = np.concatenate([none, *_chosen(rates, _whole_patches(patches, frames, points, features))])
+    u, v = needed["origin"].T
+    needed = needed[np.lexsort((needed["is_flipped"], u, v, needed["depth"], needed["corner"]))]
+    tiles, most = needed.copy(), rates.most(needed)[:, None]
+    tiles["rates"], tiles["sides"] = np.minimum(needed["rates"], most), np.minimum(needed["sides"], most)
+    if criterion.outline is None:
+        _warn_of_coarse(patches, needed, tiles, max_rate, cage_name)
     grid = AdaptiveGrid.of(tiles, frames)
     controls, refinement = patches.control_rows(control_of_vertex, len(control_points))
     polynomials = _polynomials(patches, grid)
@@ -73,36 +85,6 @@ def _polynomials(patches: PatchTable, grid: AdaptiveGrid) -> tuple[VertexPolynom
     samples, ones = ragged.index_in_row(counts), np.ones_like(distinct)
     runs = VertexRuns(patch_class[distinct], ones, samples, 0 * ones, kind, patch[order], order)
     return vertex_polynomials(table.scheme, table.classes, uv_of_class, runs)
-
-
-def choose_tiles(
-    patches: PatchTable,
-    frames: PatchFrames,  # Of ``patches``
-    control_points: FloatArray,  # (n, 3) float64
-    control_of_vertex: IntArray,  # (n_v,) int64: 0-based control point at each mesh vertex
-    criterion: Criterion,
-    # Most segments along an edge of the cage, and along each ring around an extraordinary point; rounded down to a
-    # power of two
-    max_rate: int,
-    cage_name: str,  # For warnings
-) -> Tiles:
-    """Divide the patches of a cage into tiles, in the order of the elements, and choose their rates.
-
-    Raises MemoryError if the triangles would not fit into memory. Warns if ``max_rate`` is too low for the criterion,
-    unless that is for outlines.
-    """
-    points = control_points[control_of_vertex]
-    rates = TileRates(patches.scheme, frames, criterion, max_rate)
-    features = feature_edges(patches, frames, points, criterion)
-    none = np.empty(0, dtype=tile_type(patches.scheme.domain.corner_count))
-    needed = np.concatenate([none, *_chosen(rates, _whole_patches(patches, frames, points, features))])
-    u, v = needed["origin"].T
-    needed = needed[np.lexsort((needed["is_flipped"], u, v, needed["depth"], needed["corner"]))]
-    tiles, most = needed.copy(), rates.most(needed)[:, None]
-    tiles["rates"], tiles["sides"] = np.minimum(needed["rates"], most), np.minimum(needed["sides"], most)
-    if criterion.outline is None:
-        _warn_of_coarse(patches, needed, tiles, max_rate, cage_name)
-    return tiles
 
 
 def _warn_of_coarse(patches: PatchTable, needed: Tiles, tiles: Tiles, max_rate: int, cage_name: str) -> None:
@@ -154,6 +136,12 @@ def _chosen(rates: TileRates, patches: Iterable[Part]) -> Iterator[Tiles]:
     # Tiles wait by kind, as one call bounds many tiles of a kind in little more time than one of them.
     waiting: dict[DividedTile, list[Part]] = {}
     triangle_count = waiting_count = 0
+
+    def priority(kind: DividedTile) -> int:
+        # Pieces, which are all of one kind, wait until there are enough of them. Larger tiles come before few pieces,
+        # to detect too many triangles early.
+        return 1 if not kind.is_piece else 2 * (sum(len(part.tiles) for part in waiting[kind]) > TILES_AT_ONCE)
+
     for part in chain(patches, [None]):
         if part is not None:
             waiting.setdefault(part.kind, []).append(part)
@@ -162,23 +150,18 @@ def _chosen(rates: TileRates, patches: Iterable[Part]) -> Iterator[Tiles]:
                 continue
         waiting_count = 0
         while waiting:
-            # Pieces, which are all of one kind, wait until there are enough of them. Larger tiles come first, to detect
-            # too many triangles early.
-            pieces = [kind for kind in waiting if kind.is_piece]
-            others = [kind for kind in waiting if not kind.is_piece]
-            has_enough = sum(len(part.tiles) for kind in pieces for part in waiting[kind]) > TILES_AT_ONCE
-            for kind in pieces + others if has_enough or not others else others:
-                taken = _taken(waiting[kind])
-                if not waiting[kind]:
-                    del waiting[kind]
-                done, undecided = rates.decided(taken)
-                triangle_count += int(rates.triangle_counts(done).sum())
-                if kind.is_piece:
-                    # The counts of undecided tiles are upper bounds, as division makes fewer triangles.
-                    require_memory_for_triangles(triangle_count + int(rates.triangle_counts(undecided.tiles).sum()))
-                yield done
-                for divided in rates.divided(undecided) if len(undecided.tiles) else ():
-                    waiting.setdefault(divided.kind, []).append(divided)
+            kind = max(waiting, key=priority)
+            taken = _taken(waiting[kind])
+            if not waiting[kind]:
+                del waiting[kind]
+            done, undecided = rates.decided(taken)
+            triangle_count += int(rates.triangle_counts(done).sum())
+            if kind.is_piece:
+                # The counts of undecided tiles are upper bounds, as division makes fewer triangles.
+                require_memory_for_triangles(triangle_count + int(rates.triangle_counts(undecided.tiles).sum()))
+            yield done
+            for divided in rates.divided(undecided) if len(undecided.tiles) else ():
+                waiting.setdefault(divided.kind, []).append(divided)
 
 
 def _taken(parts: list[Part]) -> Part:
