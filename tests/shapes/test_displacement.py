@@ -126,7 +126,7 @@ def assert_alike(shape, expected, atol=0.0):
 def locations(cage, rate=RATE, scheme=None):
     surface = LimitSurface(cage, scheme)
     table = surface.sampling(rate)
-    return (surface.attribute_table(table).locate or table.locations)()
+    return surface.attribute_table(table).layout.locate()
 
 
 def heights(kind):

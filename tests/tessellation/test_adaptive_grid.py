@@ -113,14 +113,14 @@ def test_attributes_are_exact_on_both_sides_of_seams(scheme, cage, np_rng):
     surface = LimitSurface(with_seams(bumpy(cage), np_rng), scheme)
     table = table_of(surface)
     found = surface.attribute_table(table)
-    assert found.surface_vertex is not None
-    np.testing.assert_array_equal(found.surface_vertex[found.triangles], table.triangles)
+    assert found.layout.surface_vertex is not None
+    np.testing.assert_array_equal(found.layout.surface_vertex[found.layout.triangles], table.triangles)
     corner, uv = table.grid.triangle_locations
     element = table.element.repeat(3)
     places = element, uv.reshape(-1, 2), corner.repeat(3) - surface.patches.elements.face_offsets[element]
     for name, values in found.values.items():
         expected = surface.evaluate_attribute(name, *places)
-        np.testing.assert_allclose(values[found.triangles.ravel()], expected, rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(values[found.layout.triangles.ravel()], expected, rtol=0, atol=ROUNDING)
 
 
 def with_a_diagonal_twice():

@@ -109,9 +109,10 @@ def test_without_seams_the_vertices_are_those_of_the_surface(scheme, np_rng):
     surface = LimitSurface(tagged(cage, attributes={"colour": Attribute(colour)}), scheme)
     table = surface.sampling(3)
     found = surface.attribute_table(table)
-    assert found.surface_vertex is None
-    assert found.triangles is table.triangles
-    assert found.gathered(colour) is colour
+    layout = found.layout
+    assert layout.surface_vertex is None
+    assert layout.triangles is table.triangles
+    assert layout.gathered(colour) is colour
     # The same weights as for points, so that these come out as points do.
     np.testing.assert_allclose(found.values["colour"], table.apply(colour)[0], rtol=0, atol=ROUNDING)
 

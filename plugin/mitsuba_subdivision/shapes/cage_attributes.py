@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from ..patches import Channel
     from ..surface import LimitSurface
     from ..tessellation.attribute_table import AttributeTable
-    from ..tessellation.vertex_table import VertexTable
 
 PREFIX = "cage_"
 # Names of attributes whose buffers would be those of every Mitsuba mesh.
@@ -106,12 +105,12 @@ class CageAttributes:
             discontinuity = flags.Discontinuous if name in self.moving else flags.Differentiable
             callback.put(name, values, flags.Differentiable | discontinuity)
 
-    def set_triangles(self, table: VertexTable, attributes: AttributeTable) -> None:
+    def set_triangles(self, attributes: AttributeTable) -> None:
         """Set the tessellation whose vertices have attributes."""
         self._loaded = attributes.values
         shown = {name: values for name, values in self._loaded.items() if name in self._channels}
         self._uploaded = {name: self._upload(values.astype(np.float32)) for name, values in shown.items()}
-        self._locations = attributes.locate or table.locations
+        self._locations = attributes.layout.locate
         self._weights: dict[tuple, Any] = {}
 
     def update(self, keys: Iterable[str]) -> list[str]:

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
     from ..surface import LimitSurface
     from ..tessellation.attribute_table import AttributeTable
-    from ..tessellation.vertex_table import VertexTable
     from .displacement import ShapeDisplacement
 
 
@@ -38,7 +37,6 @@ class DisplacedVertices:
 
     def __init__(
         self,
-        table: VertexTable,
         split: AttributeTable,  # Vertices with copies along seams, whose different displacements are averaged
         weld_target: NDArray[np.uint32] | None,  # Their `split_weld_targets`
         surface: LimitSurface,
@@ -51,7 +49,7 @@ class DisplacedVertices:
         self._types: Any = types
         # (n,) int64: corner of an element from which parameters are seen, a half-edge of `PatchTable.elements`; and
         # (n, 2) float64: parameters. Samples at corners of elements have (0, 0).
-        self._corner, self._uv = corner, uv = (split.locate or table.locations)()
+        self._corner, self._uv = corner, uv = split.layout.locate()
         self._mean: Any = None if weld_target is None else _mean_over_copies(weld_target)
         # (n,) bool: whether the slope of heights along the surface exists. It does not exist at an extraordinary point
         # where a seam ends, as positions and values contract at different rates.

@@ -109,12 +109,12 @@ class ExactShading:
             return AttributeTable(_welded(table), {})
         split = surface.attribute_table(table)
         values = {name: split.values[name] for name in surface.cage.attributes}
-        if split.surface_vertex is None:
+        if split.layout.surface_vertex is None:
             return AttributeTable(_welded(table), values)
-        _, first = np.unique(split.surface_vertex, return_index=True)
+        _, first = np.unique(split.layout.surface_vertex, return_index=True)
 
         def first_ones() -> tuple[IntArray, FloatArray]:
-            start, uv = (split.locate or table.locations)()
+            start, uv = split.layout.locate()
             return start[first], uv[first]
 
         layout = _welded(table, split.layout, first_ones)
@@ -333,7 +333,7 @@ def _facing(n: Vector3, d: Vector3, facing: Float) -> Vector3:
 def _welded(
     table: VertexTable,
     split: AttributeLayout | None = None,  # Triangles with copies of vertices along seams, if there are seams
-    # Locations of the vertices of ``split`` that provide each vertex's attributes, as for `AttributeLayout`
+    # Locations of the vertices of ``split`` that provide each vertex's attributes. By default the table's.
     locate: Callable[[], tuple[IntArray, FloatArray]] | None = None,
 ) -> AttributeLayout:
     """Triangles without copies of vertices, shared between shapes."""
@@ -343,7 +343,7 @@ def _welded(
             return table.triangles
         return table.weld_target.astype(np.uint32)[table.triangles]
 
-    return _WELDED.get((table, split), lambda: AttributeLayout(None, triangles, locate=locate))
+    return _WELDED.get((table, split), lambda: AttributeLayout(None, triangles, locate or table.locations))
 
 
 def texture_scene(variant: Variant, shape: mi.Mesh, exact: ExactShading) -> mi.Scene:

@@ -89,7 +89,7 @@ class MeshBuffers:
             self._loaded = self._held["loaded"] = _LOADED.get((self._kernel, parameters.surface.cage), LaterArrays)
         # Index of each vertex of the mesh among those of the tessellation, if seams have copies. Copies are displaced
         # differently and averaged; with exact shading, only one of them is kept.
-        copied, one_of_copies = attributes.surface_vertex, None
+        copied, one_of_copies = attributes.layout.surface_vertex, None
         self._displaced: DisplacedVertices | None = None
         if displacement is not None:
             from .displaced_vertices import DisplacedOnDevice, DisplacedVertices
@@ -97,7 +97,6 @@ class MeshBuffers:
             split = parameters.surface.attribute_table(table)
             displaced_vertices = DisplacedVertices if self._types is None else DisplacedOnDevice
             self._displaced = displaced_vertices(
-                table,
                 split,
                 split_weld_targets(table, split),
                 parameters.surface,
@@ -105,9 +104,9 @@ class MeshBuffers:
                 self._types,
                 has_normals=shading is None and not parameters.face_normals,
             )
-            if copied is None and split.surface_vertex is not None:
-                _, one_of_copies = np.unique(split.surface_vertex, return_index=True)
-            copied = split.surface_vertex
+            if copied is None and split.layout.surface_vertex is not None:
+                _, one_of_copies = np.unique(split.layout.surface_vertex, return_index=True)
+            copied = split.layout.surface_vertex
         self._copied, self._one_of_copies = self._index(copied), self._index(one_of_copies)
 
     def evaluated(
@@ -288,9 +287,9 @@ def _require_coordinates(given: int, count: int) -> None:
 
 def split_weld_targets(table: VertexTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
     """For each split vertex, the first split vertex at the same point; None if no vertex has copies."""
-    if attributes.surface_vertex is None and not table.copies.size:
+    if attributes.layout.surface_vertex is None and not table.copies.size:
         return None
-    target = attributes.gathered(table.weld_target)
+    target = attributes.layout.gathered(table.weld_target)
     first = np.empty(table.vertex_count, dtype=np.uint32)
     vertices = np.arange(len(target), dtype=np.uint32)
     # In repeated assignments the last one counts, so assign in reverse order.

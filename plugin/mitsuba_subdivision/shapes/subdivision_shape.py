@@ -138,7 +138,7 @@ def make_subdivision(
                 attributes = self._exact.welded_table(table)
             if self._exact is not None:
                 self._exact.set_triangles(table, kept)
-            self._cage.set_triangles(table, attributes)
+            self._cage.set_triangles(attributes)
             self._mesh = MeshBuffers(
                 variant,
                 table,

@@ -581,9 +581,10 @@ class LimitSurface:
         """
         table = self.sampling(rate)
         positions, normals = self.sample_vertices(table, evaluator, dtype, sample_offset)
-        mesh = self.attribute_table(table)
-        values = {name: attribute_values.copy() for name, attribute_values in mesh.values.items()}
+        attributes = self.attribute_table(table)
+        values = {name: attribute_values.copy() for name, attribute_values in attributes.values.items()}
         texcoords = values.pop(TEXCOORDS, None)
+        mesh = attributes.layout
         return Tessellation(
             mesh.gathered(positions), mesh.gathered(normals), mesh.triangles, table.element, texcoords, values
         )

@@ -30,16 +30,19 @@ class AttributeLayout:
     # seams, when both tables have the same vertices.
     surface_vertex: IntArray | None
     find_triangles: Callable[[], NDArray[np.uint32]]  # Computes `triangles` on demand
+    # Computes the locations of split vertices, on the vertices' sides of seams; see `UniformGrid.locations`
+    locate: Callable[[], tuple[IntArray, FloatArray]]
     # For each channel layout, the function that evaluates a channel at the vertices: ``(n, k)`` float64
     evaluate: tuple[Callable[[Channel], FloatArray], ...] = ()
-    # Computes the locations of split vertices, on the vertices' sides of seams; see `UniformGrid.locations`. None
-    # without seams.
-    locate: Callable[[], tuple[IntArray, FloatArray]] | None = None
 
     @cached_property
     def triangles(self) -> NDArray[np.uint32]:
         """``(m, 3)``: the vertex table's triangles in the same order, each with its corners in the same order."""
         return self.find_triangles()
+
+    def gathered(self, values: NDArray) -> NDArray:
+        """Values at split vertices, from values at the vertices of the vertex table."""
+        return values if self.surface_vertex is None else values[self.surface_vertex]
 
 
 _LAYOUTS: Shared[AttributeLayout] = Shared()
@@ -73,25 +76,6 @@ class AttributeTable:
             values[name].flags.writeable = False
         return cls(layout, values)
 
-    @property
-    def surface_vertex(self) -> IntArray | None:
-        """See `AttributeLayout`."""
-        return self.layout.surface_vertex
-
-    @property
-    def locate(self) -> Callable[[], tuple[IntArray, FloatArray]] | None:
-        """See `AttributeLayout`."""
-        return self.layout.locate
-
-    @property
-    def triangles(self) -> NDArray[np.uint32]:
-        """See `AttributeLayout`."""
-        return self.layout.triangles
-
-    def gathered(self, values: NDArray) -> NDArray:
-        """Values at the vertices of this table, from values at the vertices of the vertex table."""
-        return values if self.surface_vertex is None else values[self.surface_vertex]
-
 
 _VALUES: Shared[FloatArray] = Shared()
 
@@ -100,8 +84,6 @@ def _layout(
     table: VertexTable, patches: PatchTable, control_of_vertex: IntArray, layouts: tuple[ChannelLayout, ...]
 ) -> AttributeLayout:
     """The layout of attributes with the given channel layouts at the vertices of a tessellation."""
-    if not layouts:
-        return AttributeLayout(None, lambda: table.triangles)
     # Only elements that are faces have seams. Cutting them along seams keeps their half-edges.
     grid, surface_vertex = table.grid, None
     seams = [layout.seam for layout in layouts if layout.seam is not None]
@@ -130,5 +112,7 @@ def _layout(
         vertices = grid.vertices_of(channel_table.grid)
         return lambda channel: channel_table.interpolated(channel.values[channel.value_index])[vertices]
 
-    triangles = grid.triangles if seams else lambda: table.triangles
-    return AttributeLayout(surface_vertex, triangles, tuple(map(evaluate, layouts)), locate if seams else None)
+    evaluations = tuple(map(evaluate, layouts))
+    if not seams:
+        return AttributeLayout(None, lambda: table.triangles, table.locations, evaluations)
+    return AttributeLayout(surface_vertex, grid.triangles, locate, evaluations)
