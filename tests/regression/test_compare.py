@@ -216,11 +216,12 @@ def test_one_batch_has_no_variance_and_a_reference_needs_16_times_the_samples(re
 @pytest.mark.parametrize("role", ["test", "reference"])
 def test_what_is_not_finite_fails_first_and_by_name(reference, np_rng, value, role):
     pixels = reference.pixels.copy()
-    pixels[3, 5, 1] = value
+    pixels[3:5, 5, 1] = pixels[4, 6, 0] = value
     broken = replace(reference, pixels=pixels)
     result = compare(broken, random_image(np_rng)) if role == "reference" else compare(reference, broken)
     assert (statuses(result), result.worst.x, result.worst.y) == ({"finite": "fail"}, 5, 3)
-    assert result.tier("finite").lines == [f"the {role} is not: G = {value} at x = 5, y = 3"]
+    (line,) = result.tier("finite").lines
+    assert line == f"the {role} is not: G = {value} at x = 5, y = 3 and at 2 more pixels; channels R, G"
 
 
 PROBES = {

@@ -18,8 +18,7 @@ CAUGHT_BY = {
     "normals of a patch turned by 0.1 degrees": {"probe", "paired"},
     "one vertex moved by 1e-3": {"probe", "paired"},
     "Stam's form": {"probe", "paired", "tile"},
-    "a weight wrong by 1e-3, from one neighbour": {"probe", "paired"},
-    "a weight wrong by 1e-3, from all neighbours": {"probe", "paired"},
+    "a weight wrong by 1e-3": {"probe", "paired"},
 }
 
 
@@ -52,13 +51,11 @@ def test_defects_are_caught(reference, valence, name):
 
 
 @pytest.mark.parametrize("valence", [3], indirect=True)
-@pytest.mark.parametrize(
-    ("load", "seeds", "status"), [(scene_of, 3, Status.PASS), (DEFECTS["albedo + 1 %"], 2, Status.FAIL)]
-)
-def test_the_tile_tier_is_sure_of_one_per_cent_and_of_nothing(reference, valence, load, seeds, status):
+@pytest.mark.parametrize(("load", "status"), [(scene_of, Status.PASS), (DEFECTS["albedo + 1 %"], Status.FAIL)])
+def test_the_tile_tier_is_sure_of_one_per_cent_and_of_nothing(reference, valence, load, status):
     """At the usual 256 samples."""
     scene = load(valence)
-    result = [compare(reference, render_like(reference, scene, seed=seed), ["tile"]) for seed in range(seeds)]
+    result = [compare(reference, render_like(reference, scene, seed=seed), ["tile"]) for seed in (0, 1)]
     assert [str(comparison) for comparison in result if comparison.status is not status] == []
 
 
@@ -71,6 +68,7 @@ def test_a_failure_by_chance_gets_a_second_attempt(reference, valence):
     assert (samples == 256) == any("second attempt" in note for note in tried.notes)
 
 
+@pytest.mark.parametrize("valence", [5], indirect=True)
 def test_scalar_and_llvm_see_the_same_geometry(reference, valence):
     """Other samples, so the tile tier decides on the pixels."""
     mi.set_variant("scalar_rgb")
