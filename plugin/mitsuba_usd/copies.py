@@ -15,7 +15,7 @@ import numpy as np
 from mitsuba_subdivision.cage import Attribute, CageContents, CageSource
 from mitsuba_subdivision.files import reversed_order
 from mitsuba_subdivision.mesh import IntArray
-from mitsuba_subdivision.studio import points_at
+from mitsuba_subdivision.mitsuba_mesh import points_at
 from numpy.typing import NDArray
 
 from .contents import SceneContents, ShapeContents

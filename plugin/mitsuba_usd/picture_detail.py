@@ -10,15 +10,14 @@ from typing import Any
 import numpy as np
 from mitsuba_subdivision.cage import CageContents, CageError, ControlCage
 from mitsuba_subdivision.mesh import IntArray, Topology
+from mitsuba_subdivision.mitsuba_mesh import box_corners, points_at
 from mitsuba_subdivision.schemes import SchemeError
 from mitsuba_subdivision.studio import (
     MOST_SEGMENTS,
     MOST_TRIANGLES,
-    box_corners,
     highest_rate,
     outline_for,
     pixels_of_boxes,
-    points_at,
     segments_for,
     triangles_for,
 )

@@ -26,8 +26,9 @@ from mitsuba_subdivision.cage import (
 )
 from mitsuba_subdivision.mesh import IntArray, ragged
 from mitsuba_subdivision.messages import counted
+from mitsuba_subdivision.mitsuba_mesh import PolygonMesh, box_corners, points_at
 from mitsuba_subdivision.schemes import SchemeError
-from mitsuba_subdivision.studio import PolygonMesh, box_corners, frame_table, points_at, set_parameters
+from mitsuba_subdivision.studio import frame_table, set_parameters
 from mitsuba_subdivision.surface import LimitSurface
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray

@@ -16,6 +16,7 @@ import numpy as np
 from mitsuba_subdivision.cage import CageError, in_digits, same
 from mitsuba_subdivision.files import require_usd
 from mitsuba_subdivision.messages import timed
+from mitsuba_subdivision.mitsuba_mesh import with_meshes
 from mitsuba_subdivision.studio import (
     DEFAULT_SPP,
     DEFAULT_VIEW,
@@ -30,7 +31,6 @@ from mitsuba_subdivision.studio import (
     set_parameters,
     shading_for,
     variant_in_use,
-    with_meshes,
 )
 from mitsuba_subdivision.variants import SceneNode, variant_set
 from numpy.typing import NDArray

@@ -9,8 +9,7 @@ from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.shapes import interaction_hook
 from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import StillPicture, Turntable
-from mitsuba_subdivision.studio.cage_scenes import CageScenes
-from mitsuba_subdivision.studio.model import Model
+from mitsuba_subdivision.studio.cage_scenes import CageScenes, Model
 from mitsuba_subdivision.studio.picture import ERRORS
 from mitsuba_subdivision.studio.studio_entries import Look
 

@@ -17,8 +17,7 @@ from mitsuba_subdivision.files import formats
 from mitsuba_subdivision.shapes.exact_shading import ExactShading
 from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import FrameRange, Turntable, load_quietly
-from mitsuba_subdivision.studio.cage_scenes import CageScenes
-from mitsuba_subdivision.studio.model import Model
+from mitsuba_subdivision.studio.cage_scenes import CageScenes, Model
 from mitsuba_subdivision.studio.studio_entries import Look
 
 SCENES = Path(msub.example_file("human.xml")).parent

@@ -15,7 +15,7 @@ from mitsuba_subdivision.cage.errors import CageWarning
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.studio import studio, studio_scene
-from mitsuba_subdivision.studio.model import Model, up_axis_of
+from mitsuba_subdivision.studio.cage_scenes import Model
 from mitsuba_subdivision.studio.saving import save_scene
 from mitsuba_subdivision.studio.studio_entries import (
     FIELD_OF_VIEW,
@@ -248,10 +248,10 @@ def test_the_up_axis_is_the_one_of_the_file(tmp_path):
     pytest.importorskip("pxr")
     pytest.importorskip("plyfile")
     for suffix, axis in ((".obj", "y"), (".ply", "z")):
-        assert up_axis_of(tmp_path / f"a{suffix}") == axis
+        assert Model(named_cages.cube(), tmp_path / f"a{suffix}").up == axis
     for axis in ("Y", "Z"):
         (tmp_path / f"{axis}.usda").write_text(f'#usda 1.0\n( upAxis = "{axis}" )\n')
-        assert up_axis_of(tmp_path / f"{axis}.usda") == axis.lower()
+        assert Model(named_cages.cube(), tmp_path / f"{axis}.usda").up == axis.lower()
 
 
 @scalar

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mitsuba_subdivision.cage import Attribute, CageWarning, named_cages
 from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_subdivision.mitsuba_mesh import points_at
-from mitsuba_subdivision.studio.model import frame_table
+from mitsuba_subdivision.studio.cage_scenes import frame_table
 from mitsuba_subdivision.studio.picture import ERRORS, FINEST_RATE, MOST_TRIANGLES, highest_rate, outline_for
 from mitsuba_usd import copies
 from mitsuba_usd.contents import InstanceContents, SceneContents, ShapeContents

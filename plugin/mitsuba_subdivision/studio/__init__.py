@@ -1,10 +1,8 @@
 """A neutral studio around a model: camera, lights and backdrop, turntables, frames, and scenes saved as XML."""
 
-from ..mitsuba_mesh import PolygonMesh, box_corners, points_at, with_meshes
 from ..regression.scene import LoadedScene
 from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
-from .cage_scenes import studio_scene
-from .model import frame_table
+from .cage_scenes import frame_table, studio_scene
 from .picture import (
     MOST_SEGMENTS,
     MOST_TRIANGLES,
@@ -38,16 +36,13 @@ __all__ = [
     "FrameFiles",
     "LoadedScene",
     "Look",
-    "PolygonMesh",
     "StillPicture",
     "View",
-    "box_corners",
     "frame_table",
     "highest_rate",
     "load_quietly",
     "outline_for",
     "pixels_of_boxes",
-    "points_at",
     "render_denoised",
     "sampler",
     "segments_for",
@@ -57,5 +52,4 @@ __all__ = [
     "studio_scene",
     "triangles_for",
     "variant_in_use",
-    "with_meshes",
 ]

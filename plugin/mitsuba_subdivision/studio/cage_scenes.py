@@ -8,6 +8,8 @@ import tempfile
 import warnings
 import weakref
 from collections.abc import Iterator, Sequence
+from functools import cached_property
+from math import isqrt
 from pathlib import Path
 from typing import Any
 
@@ -15,17 +17,19 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage import CageError, CageWarning, ControlCage
+from ..cage import CageError, CageWarning, ControlCage, named_cages
 from ..cage.contents import CageContents, same_topology
-from ..cage.errors import warn
-from ..files.formats import read_file
+from ..cage.errors import CageSource, shortened, warn
+from ..files.formats import FORMATS, read_file
+from ..files.usd_stage import stage_up_axis
 from ..regression.scene import LoadedScene
 from ..shapes.cage_attributes import mesh_name
+from ..surface import LimitSurface
+from ..tessellation.vertex_table import VertexTable
 from ..variants import SceneNode
 from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
-from .model import Model
-from .obj_materials import material_bsdf, material_emitter
-from .picture import shading_for
+from .obj_materials import Material, material_bsdf, material_emitter, read_materials
+from .picture import MOST_SEGMENTS, highest_rate, outline_for, segments_for, shading_for, triangles_for
 from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, DEFAULT_VIEW, Look, View, studio, variant_in_use
 
 CLAY = (0.56, 0.52, 0.47)
@@ -36,6 +40,113 @@ CHECKER_SQUARES = 16
 COLOURS = ("color", "displayColor")
 WIRE_COLOUR = (0.015, 0.05, 0.12)
 WIRE_RATE = 2
+# Radius of the rods, in radii of the model, and at most in lengths of the middle edge. Balls are thicker.
+ROD, ROD_PER_EDGE, BALL = 0.0045, 0.05, 2.2
+# Square tubes and cubes have round limit surfaces, which lie so far within them: of the distance of a corner.
+_TUBE_LIMIT, _CUBE_LIMIT = 2 / 3, 1 / 2
+# Quadrilaterals of a tessellation: enough for a picture of usual size. Coarse cages have no more segments per edge than
+# the picture shows.
+QUADS = 200_000
+HIGHEST_DEFAULT_RATE = 24
+# Segments per edge between which a camera's frame may be missed, by far less than its margin; of large cages 1.
+FRAME_RATE, LARGE = 4, 20_000
+
+
+def frame_table(surface: LimitSurface) -> VertexTable:
+    """Stencils of points all over a limit surface, by which a camera frames it."""
+    return surface.sampling(1 if surface.cage.face_count > LARGE else FRAME_RATE)
+
+
+class Model:
+    """A cage, its limit surface, and the rods and balls that draw the cage."""
+
+    def __init__(
+        self,
+        cage: ControlCage,
+        path: Path | None = None,  # Its file; None for a cage in memory
+        **chosen: Any,  # What of the file: `prim`, `time` and `scheme` as for `ControlCage.from_file`
+    ) -> None:
+        self.path, self.chosen = path, {name: value for name, value in chosen.items() if value is not None}
+        self.cage, self.surface = cage, LimitSurface(cage, self.chosen.get("scheme"))
+
+    @cached_property
+    def materials(self) -> dict[str, Material]:
+        """Materials that the libraries of an OBJ file describe, by name."""
+        is_obj = self.path is not None and self.path.suffix.lower() == ".obj"
+        by_face = self.surface.scheme.element == "face" or len(self.cage.materials) == 1
+        if not (self.path and is_obj and self.cage.materials and by_face):
+            return {}
+        described = read_materials(self.path)
+        missing = ", ".join(f'"{name}"' for name in self.cage.materials if name and name not in described)
+        if described and missing:
+            warn(f'"{self.path}": no material library has {shortened(missing, 200)}; their faces are grey')
+        return described
+
+    @cached_property
+    def up(self) -> str:
+        """Axis that points up, "y" or "z", by its file; z for cages that are not from a file."""
+        return "z" if self.path is None else FORMATS[self.path.suffix.lower()].up or stage_up_axis(self.path)
+
+    @property
+    def default_rate(self) -> int:
+        """Segments per edge that are enough for a picture."""
+        return max(2, min(HIGHEST_DEFAULT_RATE, isqrt(QUADS // self.cage.face_count)))
+
+    @cached_property
+    def _frame_table(self) -> VertexTable:
+        return frame_table(self.surface)
+
+    def limit_points(self, control_points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points ``(n, 3)`` all over the limit surface of these control points."""
+        return self._frame_table.apply(control_points)[0]
+
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        """Points ``(n, 3)`` all over the limit surface."""
+        return self.limit_points(self.cage.positions)
+
+    @cached_property
+    def wire_radius(self) -> float:
+        """Radius of the rods of the drawn cage."""
+        radius = float(np.linalg.norm(np.ptp(self.points, axis=0)) / 2)
+        lengths = np.linalg.norm(np.diff(self.cage.positions[self.cage.edges], axis=1)[:, 0], axis=1)
+        return min(ROD * radius, ROD_PER_EDGE * float(np.median(lengths)))
+
+    @property
+    def wire_cage(self) -> ControlCage:
+        """The cage whose limit surface is rods along the edges and balls around the vertices of the cage."""
+        tube = np.array([[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
+        cube = named_cages.cube().face_vertices.reshape(6, 4)
+        count = len(self.cage.edges)
+        first = 8 * np.arange(count + len(np.unique(self.cage.edges)))[:, None, None]
+        faces = np.concatenate([(first[:count] + tube).reshape(-1, 4), (first[count:] + cube).reshape(-1, 4)])
+        return ControlCage(self.wire_points(self.cage.positions), faces, source=CageSource("cage wire"))
+
+    def wire_points(self, control_points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Control points of the rods and balls, from the control points ``(n, 3)`` of the cage."""
+        ends, radius = control_points[self.cage.edges], self.wire_radius
+        along = _unit(ends[:, 1] - ends[:, 0])
+        # The axis that is furthest from the edge.
+        axis = np.eye(3)[np.abs(along).argmin(axis=1)]
+        side = _unit(np.cross(along, axis))
+        across = np.stack([side, np.cross(along, side)], axis=1)
+        ring = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]) @ across * (radius / _TUBE_LIMIT)
+        tubes = ends[:, :, None] + ring[:, None]
+        corners = named_cages.cube().positions * (BALL * radius / _CUBE_LIMIT / np.sqrt(3))
+        balls = control_points[np.unique(self.cage.edges), None] + corners
+        return np.concatenate([tubes.reshape(-1, 3), balls.reshape(-1, 3)])
+
+    def triangles_for(self, sensor: SceneNode) -> SceneNode:
+        """Parameters of the coarsest exactly shaded tessellation whose facets this sensor of a scene does not see."""
+        outline, corners = outline_for(sensor), int(self.cage.face_sizes.sum())
+        segments = segments_for(self.cage, np.eye(4)[None], outline, sensor["near_clip"], "exact")
+        highest = highest_rate(segments, np.array([corners]))
+        return triangles_for(int(segments[0]), corners, min(MOST_SEGMENTS, highest), outline, highest)
+
+
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return vectors / np.where(lengths > 0, lengths, 1)
 
 
 # A model with control points of a frame, ``(n, 3)`` float64.
@@ -46,7 +157,7 @@ class CageScenes:
     """Scene source of one cage in the studio: its contents at a time, and scenes of these.
 
     Where frames have the same topology, the shape that is loaded gets other control points; its patches and weights
-    stay. Each file is read once: its control points are kept in a temporary file.
+    stay. Each file is read once: its contents are kept in a temporary file.
     Raises CageError, OSError if there is no file of a frame.
     """
 
@@ -68,47 +179,50 @@ class CageScenes:
             raise CageError(f"{self.name}: prim or time was given; expected them for a file")
         self._cage, self._look = cage, look
         self._prim, self._time, self._scheme = prim, time, scheme
-        self._size = look.size or DEFAULT_SIZE
-        if numbers is not None:
-            self._files = FrameFiles(Path(str(cage)), numbers)
-            self._first: CageContents | None = None
-            self._model: Model
-            # Control points of each frame, or all that its file holds where the topology is another.
-            self._kept = tempfile.TemporaryFile()  # noqa: SIM115 - it is closed with the object
-            weakref.finalize(self, self._kept.close)
-            self._offsets: dict[int, int] = {}
+        self._rules = {"scheme": scheme} if scheme else {}
+        self._files = None if numbers is None else FrameFiles(Path(str(cage)), numbers)
+        # Contents and model of the first frame that is read.
+        self._first: Any = None
+        self._kept = tempfile.TemporaryFile()  # noqa: SIM115 - it is closed with the object
+        weakref.finalize(self, self._kept.close)
+        self._offsets: dict[int, int] = {}
 
     def at(self, number: int | None = None) -> PosedModel:
         """The cage of a frame; by default, of the file or in memory."""
-        if number is None:
-            if isinstance(self._cage, ControlCage):
-                model = Model(self._cage, scheme=self._scheme)
-            else:
-                path = Path(self._cage)
-                model = self._model_of(self._contents(path, self._time), path, self._time)
+        if isinstance(self._cage, ControlCage):
+            model = Model(self._cage, scheme=self._scheme)
             return model, model.cage.positions
-        if number not in self._offsets:
-            return self._read(number)
-        self._kept.seek(self._offsets[number])
-        kept = pickle.load(self._kept)
-        if not isinstance(kept, CageContents):
-            return self._model, kept
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CageWarning)
-            model = self._model_of(kept, self._files.file(number), self._files.time(number))
-        return model, model.cage.positions
+        is_kept = number in self._offsets
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", CageWarning)
+            contents, path, time = self._contents(Path(self._cage), number)
+            if self._first is not None and same_topology(contents, self._first[0]):
+                # Frames of the same topology have the same warnings.
+                return self._first[1], np.asarray(contents.positions, dtype=np.float64)
+            cage = ControlCage.from_arrays(**{**contents.as_arguments(), **self._rules})
+            model = Model(cage, path, prim=self._prim, time=time, scheme=self._scheme)
+        for warning in () if is_kept else caught:
+            warn(str(warning.message))
+        self._first = self._first or (contents, model)
+        return model, cage.positions
 
-    def _contents(self, path: Path, time: float | None) -> CageContents:
-        return read_file(path, self._prim, time, {"scheme": self._scheme} if self._scheme else {})
-
-    def _model_of(self, contents: CageContents, path: Path, time: float | None) -> Model:
-        scheme = {"scheme": self._scheme} if self._scheme else {}
-        cage = ControlCage.from_arrays(**{**contents.as_arguments(), **scheme})
-        return Model(cage, path, prim=self._prim, time=time, scheme=self._scheme)
+    def _contents(self, path: Path, number: int | None) -> tuple[CageContents, Path, float | None]:
+        """Contents of the file of a frame, which are kept when they are read; the file, and the time in it."""
+        time = self._time
+        if self._files is None or number is None:
+            return read_file(path, self._prim, time, self._rules), path, time
+        path, time = self._files.file(number), self._files.time(number)
+        if number in self._offsets:
+            self._kept.seek(self._offsets[number])
+            return pickle.load(self._kept), path, time
+        contents = read_file(path, self._prim, time, self._rules)
+        self._offsets[number] = self._kept.seek(0, 2)
+        pickle.dump(contents, self._kept)
+        return contents, path, time
 
     def framing(self, contents: PosedModel) -> tuple[str, View, tuple[int, int]]:
         """Axis that points up, view and size of the picture."""
-        return self._look.up or contents[0].up, self._look.view, self._size
+        return self._look.up or contents[0].up, self._look.view, self._look.size or DEFAULT_SIZE
 
     def points(self, contents: PosedModel) -> NDArray[np.float64]:
         """Points ``(n, 3)`` in the world that the camera must see: the limit surface, and the cage if it is drawn."""
@@ -154,50 +268,33 @@ class CageScenes:
 
         Where the camera has a shutter, which a cage has not, each frame has as many scenes as sub-frames.
         """
-        scene = self.scene((self._model, self._model.cage.positions), points)
-        shared = None
+        first = self._first[1]
+        scene = self.scene((first, first.cage.positions), points)
+        shared: LoadedScene | None = None
         for number in numbers:
             model, positions = self.at(number)
-            loaded = shared if model is self._model else None
-            loaded = loaded or load_quietly({**scene, **self._shapes(model, in_memory=True)}, filter_name)
-            if model is not self._model:
-                yield loaded
+            if model is not first:
+                yield load_quietly({**scene, **self._shapes(model, in_memory=True)}, filter_name)
                 continue
-            shared = loaded
+            shared = shared or load_quietly({**scene, **self._shapes(first, in_memory=True)}, filter_name)
             surfaces = [name for name in scene if re.fullmatch(r"surface(_\d+)?", name)]
             moved = {f"{name}.control_points": positions for name in surfaces}
             if self._look.cage:
-                moved["cage.control_points"] = model.wire_points(positions)
-            set_parameters(loaded.scene, moved)
-            yield loaded
-
-    def _read(self, number: int) -> PosedModel:
-        """Read the file of a frame, and keep the data that differ from other frames."""
-        path, time = self._files.file(number), self._files.time(number)
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", CageWarning)
-            contents = self._contents(path, time)
-        self._offsets[number] = self._kept.seek(0, 2)
-        if self._first is not None and same_topology(contents, self._first):
-            positions = np.asarray(contents.positions, dtype=np.float64)
-            pickle.dump(positions, self._kept)
-            return self._model, positions
-        # Frames of the same topology have the same warnings.
-        for warning in caught:
-            warn(str(warning.message))
-        model = self._model_of(contents, path, time)
-        if self._first is None:
-            self._first, self._model = contents, model
-            pickle.dump(model.cage.positions, self._kept)
-        else:
-            pickle.dump(contents, self._kept)
-        return model, model.cage.positions
+                moved["cage.control_points"] = first.wire_points(positions)
+            set_parameters(shared.scene, moved)
+            yield shared
 
     def _shapes(self, model: Model, triangles: SceneNode | None = None, *, in_memory: bool = False) -> SceneNode:
         """Entries of the limit surface and of the drawn cage."""
         look = self._look
+        if in_memory or model.path is None:
+            # What `prim` and `time` have chosen is in the cage itself.
+            cage = model.cage.as_properties(mi) | self._rules
+        else:
+            cage = {"filename": str(model.path.resolve()), **model.chosen}
         triangles = triangles or {"tessellation_rate": look.rate or model.default_rate}
-        surface = model.as_shape(triangles, look.shading, in_memory=in_memory)
+        shading = {} if look.shading == "vertex" else {"shading": look.shading}
+        surface = {"type": "subdivision", **cage, **triangles, **shading}
         surfaces = {} if look.checker else _in_materials(model, surface, in_memory)
         surfaces = surfaces or {"surface": {**surface, "bsdf": _material(model.cage, look.checker)}}
         if not look.cage:
