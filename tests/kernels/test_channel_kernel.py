@@ -10,7 +10,7 @@ from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import Attribute
 from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.kernels.array_types import float_type_of
-from mitsuba_subdivision.kernels.channel_kernel import LinearChannelKernel, channel_kernel
+from mitsuba_subdivision.kernels.channel_kernel import ChannelKernel
 from patches.closed_cages import mixed_torus, triangulated
 from reference.refined_cages import sheet, spokes, tagged
 
@@ -59,7 +59,7 @@ def kernel_of(surface, variant):
 def evaluated(surface, name, variant, element, uv, corner):
     """``(s, k)`` value, and derivatives by u and v."""
     kernel = kernel_of(surface, variant)
-    types, channel = kernel.types, channel_kernel(surface.channel(name), kernel.walk, float_type_of(variant))
+    types, channel = kernel.types, ChannelKernel(surface.channel(name), float_type_of(variant))
     found = channel(kernel.walk.at(types.indices(element), *map(types.floats, uv.T), types.indices(corner)))
     dr.eval(found)
     return [np.array(each).astype(np.float64).reshape(-1, len(element)).T for each in found]
@@ -84,9 +84,9 @@ def test_values_by_linear_rules_are_the_channels(surface, np_rng):
         pytest.skip("a scheme without linear interpolation")
     attributes = surface.cage.attributes
     surface = LimitSurface(tagged(surface.cage, attributes=attributes, face_varying="all"), surface.scheme.name)
-    kernel, locations = kernel_of(surface, DOUBLE), random_locations(surface, np_rng, 600)
+    locations = random_locations(surface, np_rng, 600)
     for name in ("varying 1", "seams 2"):
-        assert isinstance(channel_kernel(surface.channel(name), kernel.walk, kernel.types.float), LinearChannelKernel)
+        assert surface.channel(name).is_linear
         found, *_ = evaluated(surface, name, DOUBLE, *locations)
         np.testing.assert_allclose(found, surface.evaluate_attribute(name, *locations), rtol=0, atol=ROUNDING[DOUBLE])
 

@@ -4,7 +4,7 @@
 - `WeightBlocks` makes the polynomials of patches. Patches of a class share weights; each has control points of its own.
 - `CoefficientMap` stores the polynomials of a whole piece table, for hits and samples. `VertexKernel` needs each of
   its polynomials for the vertices on it only, and stores none.
-- `ControlValues` holds the values of a cage, or what such a map makes of them, for kernels to gather from.
+- `ControlValues` holds what such a map makes of the values of a cage, for kernels to gather from.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.shared import Content, Shared, SharedArray
+from ..mesh.shared import Content, Shared
 from ..patches.piece_table import NOTHING, PACKET, piece_packets
 from .array_types import (
     NO_CONFLICTS,
@@ -362,42 +362,38 @@ def _packet_blocks(
 
 
 class ControlValues:
-    """Values of a cage, or what a linear map makes of them, in one array that kernels gather from."""
+    """What a linear map makes of the values of a cage, in one array that kernels gather from."""
 
     def __init__(
         self,
         types: ArrayTypes,
         size: int,  # Number of components of a value
-        linear_map: SparseMatrix | CoefficientMap | None = None,
+        linear_map: SparseMatrix | CoefficientMap,
     ) -> None:
         self._types, self.size, self._map = types, size, linear_map
         # Never replaced, because other objects may hold a reference to the array.
         self.flat: FloatBuffer = types.float()
         # Keeps the array that is shared with objects of equal values.
-        self._shared: SharedArray | LaterArrays | None = None
+        self._shared: LaterArrays | None = None
 
     def load(self, values: NDArray[np.floating]) -> ControlValues:
         """Set the values ``(n, k)`` of the cage, and return this object.
 
         Objects with equal values and the same map share the array until `set` is called.
         """
-        types, linear_map = self._types, self._map
-        if linear_map is None:
-            self._shared = types.shared_floats(values)
-            self.take(self._shared.array)
-        else:
-            self._shared = _MADE.get((linear_map, Content(values)), LaterArrays)
-            self.take(self._shared.get(lambda: linear_map(types.floats(values), self.size)))
+        linear_map = self._map
+        self._shared = _MADE.get((linear_map, Content(values)), LaterArrays)
+        self.take(self._shared.get(lambda: linear_map(self._types.floats(values), self.size)))
         return self
 
     def set(self, values: FloatBuffer) -> None:
         """Set the values of the cage, flat. Later lookups are attached to them."""
         self._shared = None
-        self.take(values if self._map is None else self._map(values, self.size))
+        self.take(self._map(values, self.size))
 
     def attach(self, values: FloatBuffer) -> None:
         """Attach the array to the values of the cage that it was computed from again."""
-        self.take(values if self._map is None else self._map(values, self.size, dr.detach(self.flat)))
+        self.take(self._map(values, self.size, dr.detach(self.flat)))
 
     def take(self, flat: FloatBuffer) -> None:
         """Set the array itself, or attach an equal one to other variables."""
@@ -409,7 +405,3 @@ class ControlValues:
     def are_moving(self) -> bool:
         """Whether the values are differentiated."""
         return bool(dr.grad_enabled(self.flat))
-
-    def fetch(self, index: Index, active: Mask = True) -> Value:
-        """Gather the value at an index; zero in inactive lanes."""
-        return dr.gather(self._types.vector(self.size), self.flat, index, active)

@@ -131,6 +131,24 @@ class Channel:
         columns = np.concatenate([np.arange(count), self.value_index])
         return sparse.csr_array((entries, (rows, columns)), shape=(count + t.face_count, count))
 
+    @property
+    def linear_polynomials(self) -> sparse.csr_array:
+        """Matrix from linear values to coefficients of 1, u, v and, on the square, u v, for each half-edge."""
+        from scipy import sparse
+
+        half_edges = np.arange(len(self.patches.half_edge_of_corner))
+        at_start, at_end = (
+            self._linear_terms(half_edges, np.tile(uv, (len(half_edges), 1))) for uv in ((0.0, 0.0), (0.0, 1.0))
+        )
+        (rows, coefficients), (_, (_, by_u, _)) = at_start, at_end
+        if self.patches.scheme.domain.corner_count == 4:
+            coefficients = np.concatenate([coefficients, [by_u - coefficients[1]]])
+        weights, centres = coefficients.swapaxes(0, 1), self.with_centres
+        columns = np.broadcast_to(rows[:, None], weights.shape)
+        starts = np.arange(0, weights.size + 1, rows.shape[1])
+        of_corners = sparse.csr_array((weights.ravel(), columns.ravel(), starts), (len(starts) - 1, centres.shape[0]))
+        return of_corners @ centres
+
     def _linear_terms(self, half_edge: IntArray, uv: FloatArray) -> tuple[IntArray, FloatArray]:
         """Rows ``(s, m)`` of `with_centres`, and their weights ``(3, s, m)`` in values and derivatives by u and v."""
         t, domain = self.patches.topology, self.patches.scheme.domain

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..device_arrays import mapped
 from ..kernels.array_types import Float, FloatBuffer, Mask, Value
-from ..kernels.channel_kernel import channel_kernel
+from ..kernels.channel_kernel import ChannelKernel
 from ..kernels.displacement import Displacement, Heights
 from ..kernels.surface_kernel import SurfaceKernel
 from ..mesh.connectivity import IntArray
@@ -85,7 +85,7 @@ class ShapeDisplacement:
         elif self._is_jit:
             self.kernel = SurfaceKernel(surface.pieces(), variant.Float)
             self.kernel.values.load(positions)
-            channel = channel_kernel(self._loaded, self.kernel.walk, variant.Float)
+            channel = ChannelKernel(self._loaded, variant.Float)
             self._own_values = channel.values
         if self.kernel is not None:
             self.kernel.displacement = Displacement(channel, self.heights, scale)

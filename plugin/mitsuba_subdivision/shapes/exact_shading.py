@@ -141,10 +141,9 @@ class ExactShading:
     def channel(self, name: str) -> ChannelKernel:
         """Return the kernel of an attribute of the cage or of its texture coordinates, created at the first call."""
         if name not in self._channels:
-            from ..kernels.channel_kernel import channel_kernel
+            from ..kernels.channel_kernel import ChannelKernel
 
-            kernel = self.kernel
-            self._channels[name] = channel_kernel(self._limit_surface.channel(name), kernel.walk, kernel.types.float)
+            self._channels[name] = ChannelKernel(self._limit_surface.channel(name), self.kernel.types.float)
         return self._channels[name]
 
     @property
