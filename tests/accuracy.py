@@ -15,7 +15,7 @@ import warnings
 
 import numpy as np
 from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.evaluation import element, irregular_patch, patch_tree, refined_rings
+from mitsuba_subdivision.evaluation import element, irregular_patch, patch_tree
 from mitsuba_subdivision.mesh import one_ring
 from mitsuba_subdivision.mesh.signature import signature_at
 from reference import bars
@@ -44,7 +44,7 @@ def build_time(surface: LimitSurface) -> float:
     signature = signature_at(surface.cage.topology, int(half_edge), surface.scheme.element)
     times = []
     for _ in range(3):
-        for module in (one_ring, patch_tree, element, irregular_patch, refined_rings):
+        for module in (one_ring, patch_tree, element, irregular_patch):
             for function in vars(module).values():
                 if hasattr(function, "cache_clear"):
                     function.cache_clear()

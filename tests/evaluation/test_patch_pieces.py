@@ -98,10 +98,10 @@ def test_old_and_new_points_of_one_refinement_are_as_many_as_published(valence):
 @pytest.mark.parametrize("signature", [Signature("face", (REGULAR_FAN,) * 4), isolated(5), isolated(3)])
 def test_refining_and_turning_commute(signature):
     """Child k of an element is child 0 of the element turned to its corner k, turned back."""
-    parts = refined_children(SCHEME, signature)
+    (parts,) = refined_children(SCHEME, [signature])
     for k in range(4):
         _, child, stencils = parts[k]
-        _, first, turned = refined_children(SCHEME, signature.rotated(k))[0]
+        _, first, turned = refined_children(SCHEME, [signature.rotated(k)])[0][0]
         # The child's own (0, 0) is k corners before the corner that it shares with the element.
         assert child.rotated(k) == first
         expected = np.zeros_like(turned)
@@ -118,7 +118,7 @@ def test_regular_control_points_reproduce_the_lattice():
     place = np.empty((16, 2))
     place[order] = SCHEME.regular_lattice
     np.testing.assert_array_equal(place[:4], SQUARE.corners)
-    for affine, child, stencils in refined_children(SCHEME, regular):
+    for affine, child, stencils in refined_children(SCHEME, [regular])[0]:
         assert lattice_stencils(SCHEME, child) is not None
         np.testing.assert_allclose(affine(stencils @ place), place, rtol=0, atol=ROUNDING)
 
@@ -147,7 +147,7 @@ def test_refined_children_run_the_rules_of_the_scheme():
     # Stencils averaged with those of vertex 0.
     marked_scheme = ChangedCatmullClark("marked", lambda matrix, _: (matrix + matrix[0]) / 2)
     first = SCHEME.refine(one_ring(isolated(5)).topology).stencils.matrix.toarray()[0]
-    children = (refined_children(scheme, isolated(5)) for scheme in (marked_scheme, SCHEME))
+    children = (refined_children(scheme, [isolated(5)])[0] for scheme in (marked_scheme, SCHEME))
     for (_, _, marked), (_, _, stencils) in zip(*children, strict=True):
         np.testing.assert_allclose(marked, (stencils + first) / 2, rtol=0, atol=1e-15)
 
@@ -155,4 +155,4 @@ def test_refined_children_run_the_rules_of_the_scheme():
 def test_weights_that_do_not_sum_to_one_are_an_error():
     halved = ChangedCatmullClark("halved", lambda matrix, _: 0.5 * matrix)
     with pytest.raises(SchemeError, match=r"halved: a refined vertex near a face .* sum to 0\.5; expected 1"):
-        refined_children(halved, isolated(5))
+        refined_children(halved, [isolated(5)])

@@ -9,7 +9,7 @@ from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.irregular_patch import level_domains, level_rows, rest_rows
 from mitsuba_subdivision.evaluation.patch_tree import PartKind, patch_tree, patch_trees, whole_piece
-from mitsuba_subdivision.evaluation.refined_rings import refined_ring
+from mitsuba_subdivision.evaluation.refined_rings import refined_children
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import CatmullClark, SchemeError
 from mitsuba_subdivision.schemes.domain import ParameterMap
@@ -85,11 +85,24 @@ def test_equal_one_rings_are_one_object(name):
         assert found.setdefault(element.signature, element) is element
 
 
+@EVERY_SURFACE
+def test_children_do_not_depend_on_the_one_rings_refined_beside_them(name):
+    scheme, signatures = classes(surface_named(name))
+    # Semi-sharp ones beside smooth ones.
+    signatures = [*signatures, *{signature.smoothed for signature in signatures}]
+    together = refined_children(scheme, signatures)
+    for signature, children in zip(signatures, together, strict=True):
+        (alone,) = refined_children(scheme, [signature])
+        assert [child.signature for child in children] == [child.signature for child in alone]
+        for child, same in zip(children, alone, strict=True):
+            np.testing.assert_array_equal(child.stencils, same.stencils)
+            assert child.domain.is_same(same.domain)
+
+
 @pytest.fixture
 def nothing_divided():
     """Elements of other tests are forgotten, and those of this test after it."""
     patch_tree.cache_clear()
-    refined_ring.cache_clear()
     yield
     patch_tree.cache_clear()
 
@@ -105,11 +118,11 @@ def test_equal_parts_of_a_crease_are_refined_once(monkeypatch):
     refine = CatmullClark.refine
     monkeypatch.setattr(CatmullClark, "refine", counted)
     elements = divided(LimitSurface(tagged(cube(), creases=[(a, b, 8.7) for a, b in RING])))
-    inner = [element for element in below(elements) if element.piece is None]
-    assert len(refined) == len({id(topology) for topology in refined})
-    assert len(refined) >= len({*inner})
+    inner = {element for element in below(elements) if element.piece is None}
+    # All parts of one depth are refined together; tips are looked for among them one by one.
+    assert len(refined) < len(inner) / 2
     # There are 2^9 parts along each crease, of some kinds after each of ten refinements.
-    assert 20 * len(refined) < sum(len(each.nodes) for each in elements)
+    assert 20 * sum(topology.face_count for topology in refined) < 9 * sum(len(each.nodes) for each in elements)
 
 
 @EVERY_SURFACE

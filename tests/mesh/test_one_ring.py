@@ -5,7 +5,7 @@ import pytest
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
 from mitsuba_subdivision.mesh import ragged
 from mitsuba_subdivision.mesh.one_ring import one_ring
-from mitsuba_subdivision.mesh.signature import Fan, Signature, fan_half_edges, half_edges_around, signature_at
+from mitsuba_subdivision.mesh.signature import Fan, Signature, signature_at
 from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, mixed_torus, polygons
 from reference.exact_samples import mesh_of
 from reference.refined_cages import sheet, tagged
@@ -130,13 +130,14 @@ def test_many_elements_gather_as_each_alone(topology, kind, monkeypatch):
 
 @by_name(WITH_SHEETS)
 def test_half_edges_around_each_corner_are_turns_apart(topology):
-    for half_edge in range(topology.half_edge_count):
-        fans = fan_half_edges(topology, half_edge, "face")
-        counts = [len(behind) + len(ahead) for behind, ahead in fans]
-        for fan, (_, ahead) in zip(np.split(half_edges_around(fans), np.cumsum(counts)[:-1]), fans, strict=True):
-            np.testing.assert_array_equal(topology.turn[fan[:-1]], fan[1:])
-            assert ahead[0] in fan
-            assert topology.turn[fan[-1]] in (-1, ahead[0])
+    for half_edge in half_edges_of(topology):
+        ring = one_ring(signature_at(topology, half_edge, "face"))
+        local = ring.topology
+        for around, corner in zip(ring.around, range(local.face_sizes[0]), strict=True):
+            np.testing.assert_array_equal(local.turn[around[:-1]], around[1:])
+            assert corner in around
+            assert local.turn[around[-1]] in (-1, around[0])
+            assert len(around) == np.count_nonzero(local.face_vertices == local.face_vertices[corner])
 
 
 @pytest.mark.parametrize("sharpness", [9.99, 10.0, 20.0])

@@ -89,7 +89,7 @@ class DividedTile:
         """
         if self._source is None:
             return np.empty((4, 0), dtype=np.int64)
-        t = one_ring(self._source.signature.smoothed).topology
+        t = one_ring(self._source.signature).topology
         a, b, c, d = t.face_vertices[t.face_offsets[:-1] + np.arange(4)[:, None] * t.face_sizes // 4]
         vertices = np.stack([a, c, b, d])
         if isinstance(self._source, IrregularPatch):
@@ -187,7 +187,7 @@ def part_of_tile(
     scheme, piece = element.scheme, element.piece
     if piece is None:
         if element.kind == PartKind.ONLY_CHILD:
-            child, child_stencils = element.child(0)
+            ((child, child_stencils),) = element.children
             return part_of_tile(child, child_stencils @ stencils)
         return _tile(scheme, element, 0), stencils
     if piece.patch is None:

@@ -334,7 +334,7 @@ def limit_stencil(scheme: str, valence: int) -> LimitStencil:
         slots = np.concatenate([[0], edge_ring, face_ring[: valence * (rules.regular_face_size > 3)]])
     else:
         slots = edge_ring = t.face_vertices[:valence]
-    basis = eigenbasis(refined_children(rules, signature)[0][2])
+    basis = eigenbasis(refined_children(rules, [signature])[0][0].stencils)
 
     angles = 2 * np.pi * np.arange(valence) / valence
     target = np.stack([np.cos(angles), np.sin(angles)])

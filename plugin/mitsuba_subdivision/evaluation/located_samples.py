@@ -27,7 +27,7 @@ from ..schemes.scheme import Scheme
 from .equations import Evaluator, SampleRows, locate, times_matrix
 from .irregular_patch import IrregularPatch, level_polynomials
 from .normals import TANGENT_ROUNDING
-from .patch_tree import MOST_DEPTH, PartKind, PatchTree, Piece, not_isolated
+from .patch_tree import MOST_DEPTH, PartKind, PatchTree, Piece, divide, not_isolated
 from .polynomials import polynomial_basis
 from .tree_arrays import LEVEL_PIECES, PIECE_LEVELS
 
@@ -118,6 +118,7 @@ class LocatedSamples:
             counts = [nodes[number].sample_count for number in inner]
             if not sum(counts):
                 break
+            divide(trees[number] for number in inner)
             in_inner, begins = np.concatenate([samples[number] for number in inner]), np.cumsum(counts) - counts
             child, child_uv = domain.first_child(uv[in_inner].T)
             is_only = np.repeat([trees[number].kind == PartKind.ONLY_CHILD for number in inner], counts)
@@ -129,7 +130,7 @@ class LocatedSamples:
             in_children: dict[PatchTree, tuple[int, list[IntArray]]] = {}
             for key, at in _grouped(4 * np.repeat(np.arange(len(inner)), counts) + child):
                 parent, number, in_child = nodes[inner[key // 4]], key % 4, in_inner[at]
-                tree = parent.tree.child_element(number)
+                tree, _ = parent.tree.children[number]
                 index, in_parents = in_children.setdefault(tree, (len(in_children), []))
                 in_parents.append(in_child)
                 parent.children.append((number, index, at - begins[key // 4]))
@@ -190,7 +191,9 @@ class LocatedSamples:
                 for child_number, child, at in children:
                     begins[child] += len(at)
                     child_rows = below[child][begins[child] - len(at) : begins[child]]
-                    product = times_matrix(child_rows.reshape(1, -1, child_rows.shape[2]), tree.child(child_number)[1])
+                    product = times_matrix(
+                        child_rows.reshape(1, -1, child_rows.shape[2]), tree.children[child_number][1]
+                    )
                     node_weights[at] = product.reshape(len(at), size, -1)
                 current.append(node_weights)
             below = current

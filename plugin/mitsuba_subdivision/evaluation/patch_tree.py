@@ -28,7 +28,7 @@ from ..mesh.signature import Fan, Signature
 from ..schemes.domain import IDENTITY, FloatArray, ParameterMap
 from ..schemes.scheme import Scheme, SchemeError
 from .irregular_patch import IrregularPatch
-from .refined_rings import child_domains, child_signature, child_stencils
+from .refined_rings import refined_children
 
 # Maximum number of refinements until an element without semi-sharp features consists of pieces. A scheme that needs
 # more is refused: its rules keep making new extraordinary points. The schemes of this package need one or two.
@@ -36,6 +36,8 @@ MAX_REFINEMENTS = 6
 # Number of refinements after which nothing is semi-sharp: each one reduces the sharpness, which is below `INFINITE`, by
 # one.
 MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
+# Number of control points of the one-rings that are refined together, which bounds memory to tens of megabytes.
+JOINED_CONTROLS = 1 << 14
 # Maximum depth of a patch tree.
 MOST_DEPTH = MOST_SEMI_SHARP_REFINEMENTS + MAX_REFINEMENTS + 1
 
@@ -60,9 +62,8 @@ class PatchTree:
 
     def __init__(self, scheme: Scheme, signature: Signature) -> None:
         self.scheme, self.signature = scheme, signature
-        self.control_count = one_ring(signature.smoothed).vertex_count
-        self._children: dict[int, PatchTree] = {}
-        self._stencils: dict[int, FloatArray] = {}
+        self.control_count = one_ring(signature).vertex_count
+        self._children: list[tuple[PatchTree, FloatArray]] = []
 
     @cached_property
     def piece(self) -> Piece | None:
@@ -72,7 +73,7 @@ class PatchTree:
     @cached_property
     def kind(self) -> PartKind:
         if self.piece is None:
-            return PartKind.ONLY_CHILD if len(self.domains) == 1 else PartKind.DIVIDED
+            return PartKind.ONLY_CHILD if len(self.children) == 1 else PartKind.DIVIDED
         return PartKind.REGULAR if self.piece.patch is None else PartKind.TIP
 
     @cached_property
@@ -83,51 +84,27 @@ class PatchTree:
         domain = self.scheme.domain
         return next(turn for turn in range(domain.corner_count) if domain.rotation(turn).is_same(self.piece.domain))
 
-    @cached_property
-    def domains(self) -> tuple[ParameterMap, ...]:
-        """Maps from the element's parameters to those of each child: `ParameterDomain.children`, or the identity.
-
-        Raises SchemeError if the scheme divides domains differently.
-        """
-        domains = child_domains(self.scheme, self.signature)
-        expected = (IDENTITY,) if len(domains) == 1 else self.scheme.domain.children
-        if len(domains) != len(expected) or not all(a.is_same(b) for a, b in zip(domains, expected, strict=True)):
-            raise SchemeError(
-                f"{self.scheme.name}: a child's domain is none of {len(expected)} copies, in their order; expected "
-                "the four of `ParameterDomain.children`, or the whole domain"
-            )
-        return expected
-
-    def child(self, number: int) -> tuple[PatchTree, FloatArray]:
-        """Return a child and its stencils over the element's control points: ``(K_child, K)`` float64."""
-        if number not in self._stencils:
-            self._stencils[number] = child_stencils(self.scheme, self.signature, number)
-        return self.child_element(number), self._stencils[number]
-
-    def child_element(self, number: int) -> PatchTree:
-        if number not in self._children:
-            self._children[number] = patch_tree(self.scheme, child_signature(self.scheme, self.signature, number))
-        return self._children[number]
-
     @property
     def children(self) -> list[tuple[PatchTree, FloatArray]]:
-        """All children with their stencils, as returned by `child`; empty for a piece."""
-        return [] if self.piece is not None else [self.child(number) for number in range(len(self.domains))]
+        """All children with their stencils over the element's control points, ``(K_child, K)``; empty for a piece."""
+        if self.piece is None and not self._children:
+            divide([self])
+        return self._children
 
-    @cached_property
-    def child_elements(self) -> list[PatchTree]:
-        """All children; empty for a piece."""
-        return [] if self.piece is not None else [self.child_element(number) for number in range(len(self.domains))]
+    @property
+    def domains(self) -> tuple[ParameterMap, ...]:
+        """Maps from the element's parameters to those of each child: `ParameterDomain.children`, or the identity."""
+        return (IDENTITY,) if len(self.children) == 1 else self.scheme.domain.children
 
     @cached_property
     def regular_count(self) -> int:
         """Number of regular pieces."""
-        return int(self.kind == PartKind.REGULAR) + sum(child.regular_count for child in self.child_elements)
+        return int(self.kind == PartKind.REGULAR) + sum(child.regular_count for child, _ in self.children)
 
     @cached_property
     def tip_count(self) -> int:
         """Number of tips."""
-        return int(self.kind == PartKind.TIP) + sum(child.tip_count for child in self.child_elements)
+        return int(self.kind == PartKind.TIP) + sum(child.tip_count for child, _ in self.children)
 
     @cached_property
     def tips(self) -> tuple[Piece, ...]:
@@ -146,7 +123,7 @@ class PatchTree:
         if self.piece is not None:
             return np.eye(2)[None][: self.regular_count], np.zeros((self.regular_count, 2))
         matrices, offsets = [], []
-        for domain, child in zip(self.domains, self.child_elements, strict=True):
+        for domain, (child, _) in zip(self.domains, self.children, strict=True):
             to_element, (inner_matrices, inner_offsets) = domain.inverse(), child.regular_domains
             matrices.append(to_element.matrix @ inner_matrices)
             offsets.append(inner_offsets @ to_element.matrix.T + to_element.offset)
@@ -165,7 +142,7 @@ class PatchTree:
     @cached_property
     def _below(self) -> IntArray:
         """`nodes` without the root."""
-        children = self.child_elements
+        children = [child for child, _ in self.children]
         rows, below = [np.empty((0, 3), dtype=np.int64)], []
         # For each `PartKind` the next index: of a node for inner nodes, of a piece for regular pieces and tips.
         first = np.array([len(children), len(children), 0, 0])
@@ -202,16 +179,37 @@ def patch_tree(scheme: Scheme, signature: Signature) -> PatchTree:
     return PatchTree(scheme, signature)
 
 
+def divide(elements: Iterable[PatchTree]) -> None:
+    """Make the children of elements that have none yet: refined together, they take little longer than one.
+
+    Raises SchemeError if the scheme divides domains differently from `ParameterDomain.children`.
+    """
+    undivided = [element for element in dict.fromkeys(elements) if element.piece is None and not element._children]
+    runs = np.cumsum([element.control_count for element in undivided]) // JOINED_CONTROLS
+    for run in np.split(np.arange(len(undivided)), np.flatnonzero(np.diff(runs)) + 1) if undivided else ():
+        scheme, in_run = undivided[0].scheme, [undivided[index] for index in run]
+        of_run = refined_children(scheme, [element.signature for element in in_run])
+        for element, children in zip(in_run, of_run, strict=True):
+            copies = (IDENTITY,) if len(children) == 1 else scheme.domain.children
+            is_same = [child.domain.is_same(copy) for child, copy in zip(children, copies, strict=False)]
+            if len(children) != len(copies) or not all(is_same):
+                raise SchemeError(
+                    f"{scheme.name}: a child's domain is none of {len(copies)} copies, in their order; expected "
+                    "the four of `ParameterDomain.children`, or the whole domain"
+                )
+            element._children = [(patch_tree(scheme, child.signature), child.stencils) for child in children]
+
+
 def patch_trees(scheme: Scheme, signatures: Iterable[Signature]) -> list[PatchTree]:
     """Return completely divided patch trees of signatures; equal ones are the same object.
 
-    Raises SchemeError if refinement does not separate the irregularities of a one-ring, or the scheme divides domains
-    differently from `ParameterDomain.children`.
+    Raises SchemeError if refinement does not separate the irregularities of a one-ring, or as `divide` does.
     """
     elements = [patch_tree(scheme, signature) for signature in signatures]
     undivided = list(dict.fromkeys(elements))
     for _ in range(MOST_DEPTH + 1):
-        undivided = list(dict.fromkeys(child for element in undivided for child in element.child_elements))
+        divide(undivided)
+        undivided = list(dict.fromkeys(child for element in undivided for child, _ in element.children))
         if not undivided:
             return elements
     raise not_isolated(scheme, undivided[0].signature, MOST_DEPTH + 1)
@@ -336,14 +334,15 @@ def irregular_patch(scheme: Scheme, signature: Signature) -> IrregularPatch | No
     # The other corners of the element are corners of the regular children, too.
     if not all(_is_regular_fan(scheme, fan) for fan in signature.fans[1:]):
         return None
-    if len(child_domains(scheme, signature)) != count or child_signature(scheme, signature, 0) != signature:
+    ((first, *others),) = refined_children(scheme, [signature])
+    if len(others) != count - 1 or first.signature != signature:
         return None
-    matrix, regular_stencils = child_stencils(scheme, signature, 0), []
-    for number in range(1, count):
-        lattice = lattice_stencils(scheme, child_signature(scheme, signature, number))
+    matrix, regular_stencils = first.stencils, []
+    for child in others:
+        lattice = lattice_stencils(scheme, child.signature)
         if lattice is None:
             return None
-        regular_stencils.append(lattice @ child_stencils(scheme, signature, number))
+        regular_stencils.append(lattice @ child.stencils)
     children = np.stack(regular_stencils)
     slots = np.arange(len(matrix))
     if (merged := _merged_slots(signature)) is not None:

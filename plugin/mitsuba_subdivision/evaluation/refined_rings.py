@@ -1,94 +1,78 @@
-"""One refinement of one-rings: the children of an element.
+"""One refinement of one-rings: the children of elements.
 
 An element usually has four children, which are copies of its domain. An element that does not fit the domain, such as a
 corner of a pentagon under Catmull-Clark, has one child that does.
 
-Semi-sharp features change the weights of refined vertices, but not the refined connectivity. So connectivity is
-computed once for all one-rings that differ in semi-sharp features only.
+One-rings are small, and a surface may have hundreds of kinds of them. So they are refined side by side, as one mesh.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
+from ..mesh import ragged
 from ..mesh.connectivity import IndexArray
-from ..mesh.one_ring import one_ring
-from ..mesh.signature import (
-    Signature,
-    fan_half_edges,
-    half_edges_around,
-    smooth_signature,
-    with_sharpness,
-)
+from ..mesh.one_ring import joined_rings, one_ring
+from ..mesh.signature import Signature, signature_at
 from ..schemes.domain import FloatArray, ParameterMap
-from ..schemes.scheme import Refinement, Scheme, SchemeError
+from ..schemes.scheme import Scheme, SchemeError
 
 # Tolerance when comparing the sum of a stencil's weights with 1.
 ROW_SUM = 1e-12
 
 
-# The limit is that of `patch_tree`.
-@lru_cache(maxsize=8192)
-def refined_ring(scheme: Scheme, signature: Signature) -> Refinement:
-    """Refine the one-ring of a signature."""
-    refined = scheme.refine(one_ring(signature).topology)
-    if not signature.is_semi_sharp:
-        return refined
-    smooth, topology = refined_ring(scheme, signature.smoothed).topology, refined.topology
-    return Refinement(smooth.with_rules(topology.vertex_rules, topology.semi_sharpness), refined.stencils)
+class Child(NamedTuple):
+    """A child of an element."""
+
+    domain: ParameterMap  # From the element's parameters to the child's
+    signature: Signature
+    stencils: FloatArray  # (K_child, K) float64: the child's control points over those of the element
 
 
-@lru_cache(maxsize=1024)
-def _children(scheme: Scheme, smooth: Signature) -> list[tuple[ParameterMap, int]]:
-    """Return the domain and the half-edge in the refined mesh of each child."""
-    return scheme.children(one_ring(smooth).topology, refined_ring(scheme, smooth).topology, 0)
-
-
-def child_domains(scheme: Scheme, signature: Signature) -> tuple[ParameterMap, ...]:
-    """Return the maps from an element's parameters to those of each child."""
-    return tuple(domain for domain, _ in _children(scheme, signature.smoothed))
-
-
-@lru_cache(maxsize=4096)
-def _smooth_child(scheme: Scheme, smooth: Signature, number: int) -> tuple[Signature, IndexArray, IndexArray]:
-    """Return signature, control points and half-edges of a child in the refined one-ring.
-
-    The half-edges are those of the fans at its corners, fan by fan; in each fan the clockwise ones come first.
-    """
-    topology, half_edge = refined_ring(scheme, smooth).topology, _children(scheme, smooth)[number][1]
-    fans = fan_half_edges(topology, half_edge, scheme.element)
-    signature = smooth_signature(topology, fans, scheme.element)
-    return signature, one_ring(signature).gather(topology, np.array([half_edge]))[0], half_edges_around(fans)
-
-
-def child_signature(scheme: Scheme, signature: Signature, number: int) -> Signature:
-    """Return the signature of a child."""
-    smooth, _, around = _smooth_child(scheme, signature.smoothed, number)
-    return with_sharpness(smooth, refined_ring(scheme, signature).topology, around)
-
-
-def child_stencils(scheme: Scheme, signature: Signature, number: int) -> FloatArray:
-    """Return ``(K_child, K)`` stencils of a child's control points over those of the element.
+def refined_children(scheme: Scheme, signatures: Sequence[Signature]) -> list[list[Child]]:
+    """Return the children of elements of some signatures.
 
     Raises SchemeError if the weights of a control point do not sum to one.
     """
-    smooth = signature.smoothed
-    stencils = refined_ring(scheme, signature).stencils.dense(_smooth_child(scheme, smooth, number)[1])
-    error = np.abs(stencils.sum(axis=1) - 1)
+    rings = joined_rings(signatures)
+    refined, table = scheme.refine(rings.topology)
+    parts = [scheme.children(rings.topology, refined, first) for first in rings.first_half_edges.tolist()]
+    half_edges = np.array([half_edge for children in parts for _, half_edge in children])
+    child_signatures = [signature_at(refined, half_edge, scheme.element) for half_edge in half_edges.tolist()]
+    # Children of equal connectivity are gathered at once.
+    alike: dict[Signature, list[int]] = {}
+    for index, signature in enumerate(child_signatures):
+        alike.setdefault(signature.smoothed, []).append(index)
+    controls: dict[int, IndexArray] = {}
+    for signature, indices in alike.items():
+        controls |= zip(indices, one_ring(signature).gather(refined, half_edges[indices]), strict=True)
+
+    parent = np.repeat(np.arange(len(parts)), [len(children) for children in parts])
+    row_counts = np.array([len(controls[index]) for index in range(len(parent))])
+    parent_of_row = np.repeat(parent, row_counts)
+    # Rows of all children, each as long as the one-ring of the parent has vertices.
+    offsets = ragged.offsets(np.diff(rings.first_vertices)[parent_of_row])
+    rows, columns, weights = table.entries(np.concatenate([controls[index] for index in range(len(parent))]))
+    error = np.abs(np.bincount(rows, weights, minlength=len(parent_of_row)) - 1)
     # `not <=` also refuses NaN.
     if not error.max() <= ROW_SUM:
+        worst = int(np.argmax(error))
+        smooth, total = signatures[parent_of_row[worst]].smoothed, weights[rows == worst].sum()
         raise SchemeError(
             f"{scheme.name}: a refined vertex near a {smooth.kind} with fans {smooth.fans} has "
-            f"weights that sum to {stencils[np.argmax(error)].sum():.12g}; expected 1"
+            f"weights that sum to {total:.12g}; expected 1"
         )
-    return stencils
-
-
-def refined_children(scheme: Scheme, signature: Signature) -> list[tuple[ParameterMap, Signature, FloatArray]]:
-    """Return domain, signature and stencils of all children of an element."""
-    return [
-        (domain, child_signature(scheme, signature, number), child_stencils(scheme, signature, number))
-        for number, domain in enumerate(child_domains(scheme, signature))
+    places = offsets[rows] + columns - rings.first_vertices[parent_of_row[rows]]
+    flat: FloatArray = np.bincount(places, weights, minlength=offsets[-1]).astype(np.float64, copy=False)
+    blocks = np.split(flat, offsets[ragged.offsets(row_counts)[1:-1]])
+    domains = [domain for children in parts for domain, _ in children]
+    children = [
+        Child(domain, signature, block.reshape(count, -1))
+        for domain, signature, block, count in zip(domains, child_signatures, blocks, row_counts.tolist(), strict=True)
     ]
+    ends = ragged.offsets([len(children) for children in parts]).tolist()
+    return [children[begin:end] for begin, end in pairwise(ends)]

@@ -47,7 +47,7 @@ def check_scheme(scheme: Scheme) -> None:
         element_count = 1 if unsupported is None or unsupported.kind == "face" else len(signature.fans)
         if unsupported is not None and np.min(unsupported.indices) < element_count:
             continue
-        for _, _, stencils in refined_children(scheme, signature):
+        for _, _, stencils in refined_children(scheme, [signature])[0]:
             _check_signs(scheme, stencils)
         LocatedSamples(scheme, [patch_tree(scheme, signature)], np.zeros(1, int), inside, np.zeros(1, int))
         patch = irregular_patch(scheme, signature)
@@ -74,7 +74,7 @@ def _check_basis(scheme: Scheme) -> None:
 def _check_basis_fits(scheme: Scheme, signature: Signature) -> None:
     """Check that a regular patch and its refinement are the same surface."""
     lattice, uv = lattice_stencils(scheme, signature), _inner(scheme)
-    for number, (domain, child, stencils) in enumerate(refined_children(scheme, signature)):
+    for number, (domain, child, stencils) in enumerate(refined_children(scheme, [signature])[0]):
         fine = lattice_stencils(scheme, child)
         if lattice is None or fine is None:
             raise SchemeError(f"{scheme.name}: child {number} of a regular face with fans {signature.fans} is not")
@@ -91,7 +91,7 @@ def _check_local_borders(scheme: Scheme) -> None:
         weights = []
         for behind in (3, 5):
             signature = Signature("face", (Fan(faces * 3, faces * behind, rule), *others))
-            _, _, stencils = refined_children(scheme, signature)[0]
+            _, _, stencils = refined_children(scheme, [signature])[0][0]
             first, *_, last = one_ring(signature).edge_neighbours()
             inner = np.abs(np.delete(stencils[0], [0, first, last])).max()
             _require(inner == 0, scheme, "has_local_borders, but an inner vertex has a weight for one on a border")

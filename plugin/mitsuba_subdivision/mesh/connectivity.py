@@ -209,7 +209,16 @@ class Topology:
         """``(n_v,)`` whether each vertex is on a border."""
         return self.ends_of(self.twin < 0)
 
-    @property
+    @cached_property
+    def edge_sharpness(self) -> NDArray[np.float64]:
+        """``(n_h, 3)`` sharpness of each half-edge's edge; after the next refinement, of its near half and far half."""
+        semi = self.semi_sharpness
+        if semi is None:
+            return np.zeros((self.half_edge_count, 3))
+        far_half = np.where(self.twin < 0, 0, semi.edges_refined[self.twin])
+        return np.stack([semi.edges, semi.edges_refined, far_half], axis=1)
+
+    @cached_property
     def is_semi_sharp_vertex(self) -> NDArray[np.bool_]:
         """``(n_v,)`` whether each vertex, or an edge at it, is semi-sharp, including edges across a cut."""
         semi = self.semi_sharpness
@@ -252,7 +261,7 @@ class Topology:
         """Return the same mesh with other rules. It shares the connectivity that is already computed."""
         same = Topology(self.vertex_count, self.face_sizes, self.face_vertices, self.edge_names, rules, semi_sharpness)
         for name, value in vars(self).items():
-            if name not in ("vertex_rules", "semi_sharpness"):
+            if name not in ("vertex_rules", "semi_sharpness", "edge_sharpness", "is_semi_sharp_vertex"):
                 vars(same)[name] = value
         return same
 

@@ -7,17 +7,19 @@ still correct, because the weights of equal vertices add up.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import ragged
-from .connectivity import IndexArray, Topology
+from .connectivity import IndexArray, IntArray, Topology
 from .sharpness import SemiSharpness
-from .signature import NEAR_FACES, Signature
+from .signature import NEAR_FACES, Fan, Signature
 
 # Steps from one half-edge to another: to the next one of its face, and to its twin.
 NEXT, TWIN = range(2)
@@ -76,15 +78,14 @@ class OneRing:
 
 @lru_cache(maxsize=4096)
 def one_ring(signature: Signature) -> OneRing:
-    """Return the unfolded one-ring of a signature.
+    """Return the unfolded one-ring of a signature; semi-sharp features change nothing.
 
     The faces around each corner are glued along the edges at the corner, and nowhere else. Two walks lead to the same
     face only if both cross the same edge of another face.
     """
-    fans, smooth = signature.fans, signature.smoothed
-    if smooth != signature:
-        ring = one_ring(smooth)
-        return replace(ring, topology=_with_sharpness(ring, signature))
+    if signature.is_semi_sharp:
+        return one_ring(signature.smoothed)
+    fans = signature.fans
     sizes, following, preceding, twin, around = _glued_faces(signature)
     # Vertices are numbered by their first half-edges.
     vertex, first = [-1] * len(twin), list[int]()
@@ -127,32 +128,65 @@ def _way(sizes: list[int], following: list[int], twin: list[int]) -> dict[int, t
     return way
 
 
-def _with_sharpness(ring: OneRing, signature: Signature) -> Topology:
-    """Return the topology of a one-ring with the semi-sharp features at the corners of its element.
+class JoinedRings(NamedTuple):
+    """The one-rings of several signatures side by side in one mesh, with their semi-sharp features."""
 
-    Of the features elsewhere in the one-ring, only the refined sharpness at the far ends of the edges at the corners
+    topology: Topology
+    first_half_edges: IntArray  # (r,) half-edge 0 of each ring, which names its element
+    first_vertices: IntArray  # (r + 1,) vertices of ring i are first_vertices[i] up to first_vertices[i + 1]
+
+
+def joined_rings(signatures: Sequence[Signature]) -> JoinedRings:
+    """Join the one-rings of signatures to one mesh."""
+    rings = [one_ring(signature) for signature in signatures]
+    parts = [ring.topology for ring in rings]
+    half_edges, vertices = (
+        ragged.offsets(counts)
+        for counts in ([part.half_edge_count for part in parts], [part.vertex_count for part in parts])
+    )
+    counts = np.diff(half_edges)
+    topology = Topology(
+        int(vertices[-1]),
+        np.concatenate([part.face_sizes for part in parts]),
+        np.concatenate([part.face_vertices for part in parts]) + np.repeat(vertices[:-1], counts),
+        np.concatenate([part.edge for part in parts]) + np.repeat(half_edges[:-1], counts),
+        np.concatenate([part.vertex_rules for part in parts]),
+    )
+    if any(signature.is_semi_sharp for signature in signatures):
+        fans = [
+            (fan, half_edge + np.array(around))
+            for signature, ring, half_edge in zip(signatures, rings, half_edges.tolist(), strict=False)
+            for fan, around in zip(signature.fans, ring.around, strict=True)
+            if fan.is_semi_sharp
+        ]
+        topology = topology.with_rules(topology.vertex_rules, _semi_sharpness(topology, fans))
+    return JoinedRings(topology, half_edges[:-1], vertices)
+
+
+def _semi_sharpness(
+    topology: Topology,
+    fans: list[tuple[Fan, IntArray]],  # Semi-sharp fans, and their half-edges from the most clockwise one on
+) -> SemiSharpness:
+    """Return the semi-sharp features at the corners of elements.
+
+    Of the features elsewhere in a one-ring, only the refined sharpness at the far ends of the edges at the corners
     affects the element.
     """
-    local = ring.topology
-    edges, refined = np.zeros((2, local.half_edge_count))
-    vertices = np.zeros(local.vertex_count)
-    across: list[tuple[int, float, float, bool]] = []
-    for half_edges, fan in zip(ring.around, signature.fans, strict=True):
-        if not fan.is_semi_sharp:
-            continue
-        centre = int(local.face_vertices[half_edges[0]])
-        vertices[centre] = fan.vertex
-        across += [(centre, *row) for row in fan.across]
-        sharpness, near_half, far_half = np.array(fan.edges).T
-        edges[half_edges], refined[half_edges] = sharpness, near_half
-        twins = local.twin[half_edges]
-        inside = twins >= 0
-        edges[twins[inside]], refined[twins[inside]] = sharpness[inside], far_half[inside]
+    edges, refined = np.zeros((2, topology.half_edge_count))
+    vertices = np.zeros(topology.vertex_count)
+    half_edges = np.concatenate([around for _, around in fans])
+    sharpness, near_half, far_half = np.array([row for fan, _ in fans for row in fan.edges]).T
+    edges[half_edges], refined[half_edges] = sharpness, near_half
+    twins = topology.twin[half_edges]
+    inside = twins >= 0
+    edges[twins[inside]], refined[twins[inside]] = sharpness[inside], far_half[inside]
+    centres = topology.face_vertices[[around[0] for _, around in fans]]
+    vertices[centres] = [fan.vertex for fan, _ in fans]
+    across = [(centre, *row) for centre, (fan, _) in zip(centres.tolist(), fans, strict=True) for row in fan.across]
     vertex, across_sharpness, across_refined, sharpens = np.array(across, dtype=float).reshape(-1, 4).T
-    semi_sharpness = SemiSharpness(
+    return SemiSharpness(
         edges, refined, vertices, vertex.astype(np.int64), across_sharpness, across_refined, sharpens > 0
     )
-    return local.with_rules(local.vertex_rules, semi_sharpness)
 
 
 def _glued_faces(signature: Signature) -> tuple[list[int], list[int], list[int], list[int], list[list[int]]]:

@@ -8,7 +8,7 @@ Two classes hold sharpness, the second computed from the first:
     Infinite sharpness is represented by borders and corners of the mesh, so only finite sharpness remains. It is
     computed for each refinement of the mesh (`SemiSharpness.refined`).
 
-A `Fan` of a signature has that around one vertex, in order from one of its faces, which `one_ring` converts to a
+A `Fan` of a signature has that around one vertex, in order from one of its faces, which `joined_rings` converts to a
 `SemiSharpness` of the local mesh.
 """
 

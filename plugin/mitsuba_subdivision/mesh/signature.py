@@ -15,16 +15,13 @@ from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
-from .connectivity import IndexArray, IntArray, Topology, VertexRule
+from .connectivity import IntArray, Topology, VertexRule
 
 ElementKind = Literal["face", "vertex"]
 Number = TypeVar("Number", int, IntArray)
 
 # Maximum number of faces of an open fan in a one-ring, see `Fan.near`.
 NEAR_FACES = 64
-
-# The half-edges at which the faces of a `Fan` begin: `behind`, then `ahead`.
-FanHalfEdges = tuple[list[int], list[int]]
 
 
 class Fan(NamedTuple):
@@ -148,73 +145,38 @@ class Signature:
 
 def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signature:
     """Return the signature of one element."""
-    fans = fan_half_edges(topology, half_edge, kind)
-    return with_sharpness(smooth_signature(topology, fans, kind), topology, half_edges_around(fans))
-
-
-def fan_half_edges(topology: Topology, half_edge: int, kind: ElementKind) -> list[FanHalfEdges]:
-    """Return the half-edges of the fan at each corner of the element named by ``half_edge``."""
     corners = [half_edge]
     if kind == "face":
         while (corner := int(topology.next[corners[-1]])) != half_edge:
             corners.append(corner)
-    return [_fan_half_edges(topology, corner) for corner in corners]
+    return Signature(kind, tuple(_fan_at(topology, corner) for corner in corners))
 
 
-def half_edges_around(fans: list[FanHalfEdges]) -> IndexArray:
-    """Return the half-edges of all fans, fan by fan, each from its most clockwise half-edge on."""
-    return np.concatenate([np.array(behind[::-1] + ahead, dtype=np.int32) for behind, ahead in fans])
-
-
-def _fan_half_edges(topology: Topology, half_edge: int) -> FanHalfEdges:
+def _fan_at(topology: Topology, half_edge: int) -> Fan:
+    """Return the fan around the vertex at which a half-edge begins, from the half-edge's face on."""
+    t, semi = topology, topology.semi_sharpness
     ahead, behind = [half_edge], list[int]()
-    while (current := int(topology.turn[ahead[-1]])) not in (half_edge, -1):
+    while (current := int(t.turn[ahead[-1]])) not in (half_edge, -1):
         ahead.append(current)
-    if current < 0:
+    is_closed = current >= 0
+    if not is_closed:
         current = half_edge
-        while (current := int(topology.turn_back[current])) >= 0:
+        while (current := int(t.turn_back[current])) >= 0:
             behind.append(current)
-    return behind, ahead
-
-
-def smooth_signature(topology: Topology, fans: list[FanHalfEdges], kind: ElementKind) -> Signature:
-    """Return the signature without semi-sharp features, given the half-edges of the fans at the element's corners."""
-    t = topology
-
-    def sizes(half_edges: list[int]) -> tuple[int, ...]:
-        return tuple(t.face_sizes[t.face[half_edges]].tolist()) if half_edges else ()
-
-    def fan(behind: list[int], ahead: list[int]) -> Fan:
-        is_closed = int(t.turn[ahead[-1]]) >= 0
-        rule = VertexRule(int(t.vertex_rules[t.face_vertices[ahead[0]]]))
-        return Fan(sizes(ahead), None if is_closed else sizes(behind), rule)
-
-    return Signature(kind, tuple(fan(behind, ahead) for behind, ahead in fans))
-
-
-def with_sharpness(
-    smooth: Signature,  # Signature without semi-sharp features
-    topology: Topology,
-    around: IndexArray,  # (n,) int32: the result of `half_edges_around`
-) -> Signature:
-    """Return the signature of an element with its semi-sharp features."""
-    semi = topology.semi_sharpness
-    if semi is None:
-        return smooth
-    twins = topology.twin[around]
-    far_half = np.where(twins < 0, 0, semi.edges_refined[twins])
-    columns = semi.edges[around], semi.edges_refined[around], far_half, topology.face_vertices[around]
-    *rows, vertices = (column.tolist() for column in columns)
-    edges, fans, begin = list(zip(*rows, strict=True)), [], 0
-    for fan in smooth.fans:
-        end, at = begin + fan.face_count, vertices[begin]
-        vertex = float(semi.vertices[at])
-        across: tuple[tuple[float, float, bool], ...] = ()
-        if len(semi.across_vertex):
-            here = semi.across_vertex == at
-            values = semi.across_sharpness[here], semi.across_refined[here], semi.across_sharpens[here]
-            across = tuple(sorted(zip(*(column.tolist() for column in values), strict=True)))
-        is_semi_sharp = vertex or across or any(map(any, edges[begin:end]))
-        fans.append(fan._replace(edges=tuple(edges[begin:end]), vertex=vertex, across=across) if is_semi_sharp else fan)
-        begin = end
-    return Signature(smooth.kind, tuple(fans))
+    # From the most clockwise half-edge on.
+    around, vertex = behind[::-1] + ahead, int(t.face_vertices[half_edge])
+    sizes = t.face_sizes[t.face[around]].tolist()
+    fan = Fan(
+        tuple(sizes[len(behind) :]),
+        None if is_closed else tuple(sizes[: len(behind)][::-1]),
+        VertexRule(int(t.vertex_rules[vertex])),
+    )
+    if semi is None or not t.is_semi_sharp_vertex[vertex]:
+        return fan
+    across = []
+    if len(semi.across_vertex):
+        here = semi.across_vertex == vertex
+        columns = semi.across_sharpness[here], semi.across_refined[here], semi.across_sharpens[here]
+        across = sorted(zip(*(column.tolist() for column in columns), strict=True))
+    edges = tuple(map(tuple, t.edge_sharpness[around].tolist()))
+    return fan._replace(edges=edges, vertex=float(semi.vertices[vertex]), across=tuple(across))

@@ -136,8 +136,7 @@ class PatchTable:
         ]
         if self.scheme.has_local_borders:
             signatures = [signature.near() for signature in signatures]
-        # Semi-sharpness changes no one-ring.
-        rings = [one_ring(signature.smoothed) for signature in signatures]
+        rings = [one_ring(signature) for signature in signatures]
         counts = [ring.vertex_count for ring in rings]
         entry_counts = [count * len(corners) for count, corners in zip(counts, corners_of_class, strict=True)]
         begins = ragged.offsets(entry_counts).tolist()
@@ -377,13 +376,11 @@ def _vertex_codes(topology: Topology) -> IntArray:
 
 def _face_codes(topology: Topology) -> IntArray:
     """``(n_h,)`` code of each half-edge's face and edge: the size of the face, the sharpness of the edge."""
-    t, semi = topology, topology.semi_sharpness
+    t = topology
     size = np.broadcast_to(t.common_size, t.half_edge_count) if t.common_size else t.face_sizes[t.face]
-    if semi is None:
+    if t.semi_sharpness is None:
         return size
-    left_at_other_end = np.where(t.twin < 0, 0, semi.edges_refined[t.twin])
-    sharpness = (semi.edges, semi.edges_refined, left_at_other_end)
-    return row_codes([size, *map(_value_codes, sharpness)]).astype(np.int64)
+    return row_codes([size, *map(_value_codes, t.edge_sharpness.T)]).astype(np.int64)
 
 
 def _faces_clockwise(topology: Topology) -> IntArray:

@@ -40,6 +40,8 @@ class ParameterMap(NamedTuple):
 
     def is_same(self, other: ParameterMap) -> bool:
         """Return whether two maps are exactly equal."""
+        if self is other:
+            return True
         return np.array_equal(self.matrix, other.matrix) and np.array_equal(self.offset, other.offset)
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.sharpness import CreaseMethod
 from ..mesh.signature import ElementKind
@@ -87,16 +88,12 @@ class StencilTable:
         )
         return sparse.coo_array((self.weights, (rows, columns)), shape=shape).tocsr()
 
-    def dense(self, rows: IntArray) -> FloatArray:
-        """Return the stencils of the refined vertices ``rows``, ``(len(rows), column_count)``."""
-        new_row = np.full(self.row_count, -1)
-        new_row[rows] = np.arange(len(rows))
-        # A row that occurs several times in ``rows`` is summed at its last index, and copied to the others.
-        entry_row = new_row[self.rows]
-        is_kept = entry_row >= 0
-        flat = entry_row[is_kept] * self.column_count + self.columns[is_kept]
-        sums = np.bincount(flat, self.weights[is_kept], minlength=len(rows) * self.column_count).astype(np.float64)
-        return sums.reshape(-1, self.column_count)[new_row[rows]]
+    def entries(self, rows: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
+        """Return index in ``rows``, column and weight of the entries of refined vertices, in the order of ``rows``."""
+        counts = np.bincount(self.rows, minlength=self.row_count)
+        lengths = counts[rows]
+        entries = np.argsort(self.rows, kind="stable")[ragged.ranges(ragged.starts(counts)[rows], lengths)]
+        return np.repeat(np.arange(len(rows)), lengths), self.columns[entries], self.weights[entries]
 
 
 class Refinement(NamedTuple):
