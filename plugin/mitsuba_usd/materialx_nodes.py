@@ -10,7 +10,6 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -281,14 +280,17 @@ def node(category: str, kind: str, **inputs: Input) -> Input:
 def node_of(category: str, kind: str, given: dict[str, Input]) -> Input:
     """An expression: a node of a type, or what it comes to.
 
-    What has only constant inputs is computed. A picture that is multiplied by constants and moved by them stays a
-    picture; what changes nothing is left out.
+    What has only constant inputs is computed, what changes nothing is left out, and a picture whose channels are
+    chosen, scaled and moved by constants stays a picture.
     """
-    if category not in SAMPLED and all(map(is_constant, given.values())):
+    if category in SAMPLED:
+        return NodeContents(category, kind, given)
+    if all(map(is_constant, given.values())):
         numbers = {name: value if isinstance(value, str) else constant(value) for name, value in given.items()}
         values = operation(category, kind, numbers)
         return _plain(np.broadcast_to(values, (CHANNELS[kind],)) if values.shape[-1] == 1 else values)
-    simpler = _SIMPLER[category](kind, given) if category in _SIMPLER else None
+    simpler = _without_effect(category, kind, given)
+    simpler = _picture(category, kind, given) if simpler is None else simpler
     return NodeContents(category, kind, given) if simpler is None else simpler
 
 
@@ -308,134 +310,86 @@ def constant(given: Input, width: int | None = None) -> NDArray[np.float64]:
     return numbers if width is None else np.broadcast_to(numbers, (width,))
 
 
-def _plain(values: Values) -> float | list[float]:
-    numbers = np.asarray(values, dtype=np.float64)
-    return float(numbers[0]) if numbers.size == 1 else numbers.tolist()
-
-
 def is_all(given: Input, value: float) -> bool:
     """Whether an input is a number, or all channels of a colour are."""
     return is_constant(given) and not isinstance(given, str) and bool(np.all(np.asarray(given) == value))
 
 
-def affine(texture: Input, factor: Any, offset: Any) -> TextureContents | None:
-    """A picture times a factor and plus an offset, numbers or one for each channel.
-
-    None if it has other channels, or is no picture.
-    """
-    if not isinstance(texture, TextureContents):
-        return None
-    scales, offsets = np.ones(4), np.zeros(4)
-    try:
-        scales[texture.channels], offsets[texture.channels] = factor, offset
-    except ValueError:
-        return None
-    scale, bias, fallback = map(np.asarray, (texture.scale, texture.bias, texture.fallback))
-    return replace(
-        texture,
-        scale=(scale * scales).tolist(),
-        bias=(bias * scales + offsets).tolist(),
-        fallback=(fallback * scales + offsets).tolist(),
-    )
-
-
-def _simpler_affine(category: str, kind: str, given: dict[str, Input]) -> Input | None:
-    """A picture times constants and plus constants; an input that a neutral number is added to or multiplied by."""
+def _without_effect(category: str, kind: str, given: dict[str, Input]) -> Input | None:
+    """The input that a node comes to; None if it changes its inputs."""
+    chosen: Input | None = None
+    if category in ("constant", "dot"):
+        return given["value" if category == "constant" else "in"]
     if category in ("add", "multiply"):
         for one, other in (("in1", "in2"), ("in2", "in1")):
             if is_all(given[one], float(category == "multiply")):
-                return _as_wide(given[other], kind)
-            if category == "multiply" and is_all(given[one], 0):
-                return _plain(np.zeros(CHANNELS[kind]))
-    varying = [name for name, value in given.items() if not is_constant(value)]
-    if len(varying) > 1 or (category, varying[0]) not in _AFFINE:
+                chosen = given[other]
+            elif category == "multiply" and is_all(given[one], 0):
+                chosen = 0.0
+    elif category == "power" and is_all(given["in2"], 1):
+        chosen = given["in1"]
+    elif category == "mix":
+        is_alike = is_all(given["mix"], 0) or same(given["bg"], given["fg"])
+        chosen = given["bg"] if is_alike else given["fg"] if is_all(given["mix"], 1) else None
+    elif category in _COMPARED:
+        first, second = given["value1"], given["value2"]
+        if isinstance(first, (int, float)) and isinstance(second, (int, float)):
+            chosen = given["in1" if _COMPARED[category](first, second) else "in2"]
+    if chosen is not None and is_constant(chosen) and not isinstance(chosen, str):
+        # It may lack the width of the type.
+        return _plain(constant(chosen, CHANNELS[kind]))
+    return chosen
+
+
+_COMPARED: dict[str, Callable[[float, float], bool]] = {
+    "ifgreater": operator.gt, "ifgreatereq": operator.ge, "ifequal": operator.eq,
+}  # fmt: skip
+# Colours by which a node of pictures is tried out: black, the four channels, and some for which all channels differ.
+_TRIED_COLORS = np.array([[0.0] * 4, *np.eye(4).tolist(), [0.37, 0.61, 0.83, 0.29], [-2.3, 5.7, 17.1, -3.9]])
+
+
+def _picture(category: str, kind: str, given: dict[str, Input]) -> TextureContents | None:
+    """The picture that a node of one picture comes to: one each of whose channels is a scaled and moved one of it.
+
+    None if it is no such node. Channels of the picture may be inputs of their own.
+    """
+    pictures = [value for value in given.values() if isinstance(value, TextureContents)]
+    varying = frozenset({"channel", "scale", "bias", "fallback"})
+    if not all(isinstance(value, TextureContents) or is_constant(value) for value in given.values()):
         return None
-    constants = {name: np.asarray(value) for name, value in given.items() if name != varying[0]}
-    with np.errstate(all="ignore"):
-        factor, offset = _AFFINE[category, varying[0]](constants)
-    is_finite = np.isfinite(factor).all() and np.isfinite(offset).all()
-    return affine(given[varying[0]], factor, offset) if is_finite else None
-
-
-def _remapped(c: Mapping[str, NDArray]) -> tuple[Any, Any]:
-    factor = (c["outhigh"] - c["outlow"]) / (c["inhigh"] - c["inlow"])
-    return factor, c["outlow"] - c["inlow"] * factor
-
-
-# Factor and offset of the only input that is not constant, by category and that input.
-_AFFINE: dict[tuple[str, str], Callable[[Mapping[str, NDArray]], tuple[Any, Any]]] = {
-    ("multiply", "in1"): lambda c: (c["in2"], 0.0),
-    ("multiply", "in2"): lambda c: (c["in1"], 0.0),
-    ("divide", "in1"): lambda c: (1 / c["in2"], 0.0),
-    ("add", "in1"): lambda c: (1.0, c["in2"]),
-    ("add", "in2"): lambda c: (1.0, c["in1"]),
-    ("subtract", "in1"): lambda c: (1.0, -c["in2"]),
-    ("subtract", "in2"): lambda c: (-1.0, c["in1"]),
-    ("invert", "in"): lambda c: (-1.0, c["amount"]),
-    ("remap", "in"): _remapped,
-}
-
-
-def _simpler_mix(kind: str, given: dict[str, Input]) -> Input | None:
-    for value, name in ((0, "bg"), (1, "fg")):
-        if is_all(given["mix"], value):
-            return _as_wide(given[name], kind)
-    return _as_wide(given["bg"], kind) if same(given["bg"], given["fg"]) else None
-
-
-def _simpler_choice(compare: Callable[[float, float], bool], kind: str, given: dict[str, Input]) -> Input | None:
-    first, second = given["value1"], given["value2"]
-    if isinstance(first, (int, float)) and isinstance(second, (int, float)):
-        return _as_wide(given["in1" if compare(first, second) else "in2"], kind)
-    return None
-
-
-def _simpler_part(_kind: str, given: dict[str, Input]) -> Input | None:
-    texture, index = given["in"], given["index"]
-    if isinstance(texture, TextureContents) and isinstance(index, (int, float)) and index < len(texture.channel):
-        return replace(texture, channel=texture.channel[int(index)])
-    return None
-
-
-def _simpler_conversion(kind: str, given: dict[str, Input]) -> Input | None:
-    texture = given["in"]
-    if not isinstance(texture, TextureContents):
+    if not all(same(picture, pictures[0], varying) for picture in pictures):
         return None
-    if len(texture.channel) > CHANNELS[kind]:
-        return replace(texture, channel=texture.channel[: CHANNELS[kind]])
-    # One channel serves as a colour.
-    return texture if len(texture.channel) in (1, CHANNELS[kind]) and kind != "color4" else None
 
+    def tried(value: Input) -> Any:
+        if isinstance(value, TextureContents):
+            return np.vstack([_TRIED_COLORS * value.scale + value.bias, value.fallback])[:, value.channels]
+        return value if isinstance(value, str) else constant(value)
 
-def _simpler_combination(_kind: str, given: dict[str, Input]) -> Input | None:
-    first = given["in1"]
-    if not isinstance(first, TextureContents):
+    try:
+        values = operation(category, kind, {name: tried(value) for name, value in given.items()})
+    except (IndexError, ValueError):
         return None
-    for part, channel in zip((first, given["in2"], given["in3"]), "rgb", strict=True):
-        if not isinstance(part, TextureContents) or part.channel != channel:
-            return None
-        if not same(part, first, frozenset({"channel", "fallback"})):
-            return None
-    return replace(first, channel="rgb")
+    if values.ndim != 2 or not values.shape[1]:
+        return None
+    bias, slopes, columns = values[0], values[1:5] - values[0], np.arange(values.shape[1])
+    channels = np.abs(slopes).argmax(axis=0)
+    factor = slopes[channels, columns]
+    if not factor.all() or not np.allclose(
+        _TRIED_COLORS[:, channels] * factor + bias, values[:-1], rtol=1e-9, atol=1e-12
+    ):
+        return None
+    if np.ptp(np.vstack([channels, values]), axis=1).max() == 0:
+        # One channel serves as a colour.
+        channels, columns = channels[:1], columns[:1]
+    channel = "".join("rgba"[index] for index in channels)
+    if channel not in ("r", "g", "b", "a", "rg", "rgb", "rgba"):
+        return None
+    numbers = np.array([pictures[0].scale, pictures[0].bias, pictures[0].fallback])
+    numbers[:, channels] = np.stack([factor, bias, values[-1]])[:, columns]
+    scale, bias, fallback = numbers.tolist()
+    return replace(pictures[0], channel=channel, scale=scale, bias=bias, fallback=fallback)
 
 
-def _as_wide(given: Input, kind: str) -> Input:
-    """An input of a type, whose width it may lack."""
-    if is_constant(given) and not isinstance(given, str):
-        return _plain(constant(given, CHANNELS[kind]))
-    return given
-
-
-_SIMPLER: dict[str, Callable[[str, dict[str, Input]], Input | None]] = {
-    "constant": lambda _, given: given["value"],
-    "dot": lambda _, given: given["in"],
-    "mix": _simpler_mix,
-    "power": lambda kind, given: _as_wide(given["in1"], kind) if is_all(given["in2"], 1) else None,
-    "ifgreater": partial(_simpler_choice, operator.gt),
-    "ifgreatereq": partial(_simpler_choice, operator.ge),
-    "ifequal": partial(_simpler_choice, operator.eq),
-    "extract": _simpler_part,
-    "convert": _simpler_conversion,
-    "combine3": _simpler_combination,
-    **{category: partial(_simpler_affine, category) for category, _ in _AFFINE},
-}
+def _plain(values: Values) -> float | list[float]:
+    numbers = np.asarray(values, dtype=np.float64)
+    return float(numbers[0]) if numbers.size == 1 else numbers.tolist()

@@ -15,7 +15,7 @@ from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
 from .contents import NodeContents, TextureContents, leaves, parts
-from .materialx_nodes import Values, affine, evaluate, fallback_of
+from .materialx_nodes import Values, evaluate, fallback_of, node
 from .stage_warnings import StageWarnings
 from .texture_image import TextureImage, is_srgb_image, linear_values, read_texture_image, with_alpha
 
@@ -84,12 +84,12 @@ class Textures:
 
     def normals(self, given: TextureContents | NodeContents) -> SceneNode | None:
         """A texture of normals as Mitsuba has them, from 0 to 1; None if the picture cannot be read."""
-        if isinstance(given, NodeContents):
-            values, to_uv, wrap = self._baked(given)
-            return self._bitmap((values + 1) / 2, to_uv, wrap, is_raw=True)
-        picture = self._picture(given.file, given)
-        halved = affine(given, 0.5, 0.5)
-        return None if picture is None or halved is None else self._plain(halved, picture, is_raw=True)
+        halved = node("add", "vector3", in1=node("multiply", "vector3", in1=given, in2=0.5), in2=0.5)
+        if isinstance(halved, NodeContents):
+            return self._bitmap(*self._baked(halved), is_raw=True)
+        if not isinstance(halved, TextureContents) or (picture := self._picture(halved.file, halved)) is None:
+            return None
+        return self._plain(halved, picture, is_raw=True)
 
     def mean(self, given: TextureContents | NodeContents) -> NDArray[np.float64]:
         """Mean of a texture's values, ``(k,)``."""
