@@ -9,7 +9,6 @@ One-rings are small, and a surface may have hundreds of kinds of them. So they a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -38,25 +37,28 @@ def refined_children(scheme: Scheme, signatures: Sequence[Signature]) -> list[li
 
     Raises SchemeError if the weights of a control point do not sum to one.
     """
-    rings = joined_rings(signatures)
-    refined, table = scheme.refine(rings.topology)
-    parts = [scheme.children(rings.topology, refined, first) for first in rings.first_half_edges.tolist()]
-    half_edges = np.array([half_edge for children in parts for _, half_edge in children])
-    child_signatures = [signature_at(refined, half_edge, scheme.element) for half_edge in half_edges.tolist()]
-    # Children of equal connectivity are gathered at once.
+    topology, first_half_edges, first_vertices = joined_rings(signatures)
+    refined, table = scheme.refine(topology)
+    parts = [
+        (parent, domain, half_edge, signature_at(refined, half_edge, scheme.element))
+        for parent, first in enumerate(first_half_edges.tolist())
+        for domain, half_edge in scheme.children(topology, refined, first)
+    ]
+    # Control points of children of equal connectivity are gathered at once.
     alike: dict[Signature, list[int]] = {}
-    for index, signature in enumerate(child_signatures):
+    for index, (*_, signature) in enumerate(parts):
         alike.setdefault(signature.smoothed, []).append(index)
     controls: dict[int, IndexArray] = {}
     for signature, indices in alike.items():
-        controls |= zip(indices, one_ring(signature).gather(refined, half_edges[indices]), strict=True)
+        half_edges = np.array([parts[index][2] for index in indices])
+        controls |= zip(indices, one_ring(signature).gather(refined, half_edges), strict=True)
 
-    parent = np.repeat(np.arange(len(parts)), [len(children) for children in parts])
-    row_counts = np.array([len(controls[index]) for index in range(len(parent))])
-    parent_of_row = np.repeat(parent, row_counts)
-    # Rows of all children, each as long as the one-ring of the parent has vertices.
-    offsets = ragged.offsets(np.diff(rings.first_vertices)[parent_of_row])
-    rows, columns, weights = table.entries(np.concatenate([controls[index] for index in range(len(parent))]))
+    # A row for each control point of each child, as long as the one-ring of the parent has vertices.
+    of_children = [controls[index] for index in range(len(parts))]
+    row_counts = [len(of_child) for of_child in of_children]
+    parent_of_row = np.repeat([parent for parent, *_ in parts], row_counts)
+    offsets = ragged.offsets(np.diff(first_vertices)[parent_of_row])
+    rows, columns, weights = table.entries(np.concatenate(of_children))
     error = np.abs(np.bincount(rows, weights, minlength=len(parent_of_row)) - 1)
     # `not <=` also refuses NaN.
     if not error.max() <= ROW_SUM:
@@ -66,13 +68,10 @@ def refined_children(scheme: Scheme, signatures: Sequence[Signature]) -> list[li
             f"{scheme.name}: a refined vertex near a {smooth.kind} with fans {smooth.fans} has "
             f"weights that sum to {total:.12g}; expected 1"
         )
-    places = offsets[rows] + columns - rings.first_vertices[parent_of_row[rows]]
+    places = offsets[rows] + columns - first_vertices[parent_of_row[rows]]
     flat: FloatArray = np.bincount(places, weights, minlength=offsets[-1]).astype(np.float64, copy=False)
-    blocks = np.split(flat, offsets[ragged.offsets(row_counts)[1:-1]])
-    domains = [domain for children in parts for domain, _ in children]
-    children = [
-        Child(domain, signature, block.reshape(count, -1))
-        for domain, signature, block, count in zip(domains, child_signatures, blocks, row_counts.tolist(), strict=True)
-    ]
-    ends = ragged.offsets([len(children) for children in parts]).tolist()
-    return [children[begin:end] for begin, end in pairwise(ends)]
+    blocks = np.split(flat, offsets[np.cumsum(row_counts)[:-1]])
+    children: list[list[Child]] = [[] for _ in signatures]
+    for (parent, domain, _, signature), count, block in zip(parts, row_counts, blocks, strict=True):
+        children[parent].append(Child(domain, signature, block.reshape(count, -1)))
+    return children

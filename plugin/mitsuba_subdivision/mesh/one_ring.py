@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,16 +127,12 @@ def _way(sizes: list[int], following: list[int], twin: list[int]) -> dict[int, t
     return way
 
 
-class JoinedRings(NamedTuple):
-    """The one-rings of several signatures side by side in one mesh, with their semi-sharp features."""
+def joined_rings(signatures: Sequence[Signature]) -> tuple[Topology, IntArray, IntArray]:
+    """Join the one-rings of r signatures, with their semi-sharp features, to one mesh.
 
-    topology: Topology
-    first_half_edges: IntArray  # (r,) half-edge 0 of each ring, which names its element
-    first_vertices: IntArray  # (r + 1,) vertices of ring i are first_vertices[i] up to first_vertices[i + 1]
-
-
-def joined_rings(signatures: Sequence[Signature]) -> JoinedRings:
-    """Join the one-rings of signatures to one mesh."""
+    Returns the mesh; ``(r,)`` half-edge 0 of each ring, which names its element; and ``(r + 1,)`` offsets of vertices:
+    those of ring ``i`` are ``offsets[i]`` up to ``offsets[i + 1]``.
+    """
     rings = [one_ring(signature) for signature in signatures]
     parts = [ring.topology for ring in rings]
     half_edges, vertices = (
@@ -160,7 +155,7 @@ def joined_rings(signatures: Sequence[Signature]) -> JoinedRings:
             if fan.is_semi_sharp
         ]
         topology = topology.with_rules(topology.vertex_rules, _semi_sharpness(topology, fans))
-    return JoinedRings(topology, half_edges[:-1], vertices)
+    return topology, half_edges[:-1], vertices
 
 
 def _semi_sharpness(
