@@ -15,7 +15,7 @@ change and be differentiated.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 from weakref import WeakMethod
 
@@ -30,7 +30,7 @@ from ..kernels.array_types import ArrayTypes, Float, FloatBuffer, Index, Mask, V
 from ..mesh.shared import Shared, SharedArray
 from ..variants import Variant
 from .derivatives import Watched, computed_ones, warn_of_lost
-from .device_state import is_recording
+from .device_state import flat_type, is_recording
 from .parameter_table import errors_about
 
 if TYPE_CHECKING:
@@ -68,6 +68,8 @@ class CageAttributes:
         variant: Variant,
         surface: LimitSurface,
         names: Iterable[str],  # Names of the attributes that `traverse` exposes
+        followers: Mapping[str, Callable[[FloatBuffer], None]],  # Functions that take new values of attributes, flat
+        displaces: str | None,  # Name of the attribute whose values displace vertices
         # Method that is called with an attribute's name and the gradient by its values, by the same name, after reverse
         # mode has reached these
         on_backward: WeakMethod,
@@ -78,25 +80,18 @@ class CageAttributes:
         self._channels: dict[str, Channel] = {name: surface.channel(name) for name in names}
         # Meshes with equal values share memory until values are assigned.
         self._given = {name: self._upload(channel.values) for name, channel in self._channels.items()}
-        flat_type = self._float or dr.scalar.ArrayXf
         # Control values by names of parameters, such as "cage_texcoords"
         self.values: dict[str, FloatBuffer] = {
-            f"{PREFIX}{name}": flat_type(shared.array) for name, shared in self._given.items()
+            f"{PREFIX}{name}": flat_type(variant)(shared.array) for name, shared in self._given.items()
         }
-        self.moving: set[str] = set()  # Names of the parameters that move vertices
+        # Names of the parameters that move vertices
+        self.moving = set() if displaces is None else {f"{PREFIX}{displaces}"}
         sizes = {name: channel.values.shape[1] for name, channel in self._channels.items()}
         self._upsampling = spectral_upsampling(variant, sizes)
-        # Functions that take each new array of an attribute's values.
-        self._followers: dict[str, list[Callable[[FloatBuffer], None]]] = {}
+        self._followers = followers
         # Updated values of attributes, as watched for reverse-mode passes.
         self._moved: dict[str, FloatBuffer] = {}
         self._computed: dict[str, set[int]] = {}
-
-    def add_follower(self, name: str, take: Callable[[FloatBuffer], None], *, moves: bool = False) -> None:
-        """Call ``take`` with each new array of an attribute's values. ``moves``: whether these displace vertices."""
-        self._followers.setdefault(name, []).append(take)
-        if moves:
-            self.moving.add(f"{PREFIX}{name}")
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose the parameters."""
@@ -186,8 +181,8 @@ class CageAttributes:
         if dr.grad_enabled(values):
             values = dr.custom(Watched, {name: values}, self._on_backward, (name,))[name]
         self._moved[name] = values
-        for take in self._followers.get(name, ()):
-            take(values)
+        if name in self._followers:
+            self._followers[name](values)
 
     def _require_values(self, name: str) -> None:
         values, (count, size) = self.values[f"{PREFIX}{name}"], self._channels[name].values.shape

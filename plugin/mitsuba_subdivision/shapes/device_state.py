@@ -46,6 +46,11 @@ def is_recording() -> bool:
     return bool(dr.flag(dr.JitFlag.FreezingScope))
 
 
+def flat_type(variant: Variant) -> type:
+    """Type of a parameter that is a flat array of numbers; Mitsuba has none in scalar variants."""
+    return variant.Float if dr.is_jit_v(variant.Float) else dr.scalar.ArrayXf
+
+
 def traversed(
     variant: Variant,
     traverse: Callable[[Any], None],  # Bound method of an object, such as ``mesh.traverse``

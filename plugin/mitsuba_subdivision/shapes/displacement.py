@@ -1,36 +1,45 @@
-"""The displacement of a shape: its heights, the channel that they depend on, and their scale.
+"""The displacement of a shape: its heights, the channel that they depend on, their scale, and displaced vertices.
 
 In object space, a surface point S is displaced to S + scale h N, along the unit limit normal N. A point without a
-normal is not displaced. `kernels.displacement` has the formulas, and the displaced surface that rays intersect;
-`displaced_vertices` displaces the vertices of a tessellation.
+normal is not displaced. `kernels.displacement` has the formulas, and the displaced surface that rays intersect.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from ..device_arrays import mapped
-from ..kernels.array_types import Float, FloatBuffer, Mask, Value
+from ..evaluation.equations import AT_EXTRAORDINARY_POINT
+from ..kernels.algebra import unit
+from ..kernels.array_types import ArrayTypes, Float, FloatBuffer, Mask, Value
 from ..kernels.channel_kernel import ChannelKernel
-from ..kernels.displacement import Displacement, Heights
+from ..kernels.displacement import Displacement, Heights, displaced
+from ..kernels.linear_maps import SparseMatrix
+from ..kernels.locations import Location
+from ..kernels.piece_kernel import PatchValues
 from ..kernels.surface_kernel import SurfaceKernel
 from ..mesh.connectivity import IntArray
+from ..patches import PatchSampler, contracts_alike
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation.criterion import DisplacementBound
 from ..variants import Variant
 from .cage_attributes import mesh_name
-from .device_state import is_recording
+from .device_state import flat_type, is_recording
 
 if TYPE_CHECKING:
-    from ..kernels.linear_maps import ControlValues
+    from scipy import sparse
+
     from ..patches import Channel
+    from ..tessellation.attribute_table import AttributeTable
     from .exact_shading import ExactShading
 
 # Step of central differences of a texture, in texture coordinates.
@@ -70,24 +79,19 @@ class ShapeDisplacement:
                 "with some, or the name of an attribute"
             )
         self.heights = Heights() if isinstance(given, str) else TextureHeights(variant, given)
-        # The channel as it was loaded, and with its current values: None if these have not been read from the device.
-        self._loaded = surface.channel(self.attribute)
-        self._channel: Channel | None = self._loaded
-        self._values: FloatBuffer = None
+        # The channel with its current values on the host; after an update, these are read when they are needed.
+        self._channel, self._updated = surface.channel(self.attribute), None
         # The parameter ``displacement_scale``: a flat array of one number.
-        self.scale = variant.Float(scale) if self._is_jit else dr.scalar.ArrayXf([scale])
+        self.scale = flat_type(variant)([scale])
         # The displaced surface on the device, shared with exact shading; None in scalar variants.
         self.kernel: SurfaceKernel | None = None
-        # Values of the channel on the device; None with exact shading, whose values `CageAttributes` updates.
-        self._own_values: ControlValues | None = None
         if exact is not None:
-            self.kernel, channel = exact.kernel, exact.channel(self.attribute)
+            self.kernel = exact.kernel
         elif self._is_jit:
             self.kernel = SurfaceKernel(surface.pieces(), variant.Float)
             self.kernel.values.load(positions)
-            channel = ChannelKernel(self._loaded, variant.Float)
-            self._own_values = channel.values
         if self.kernel is not None:
+            channel = ChannelKernel(self._channel, variant.Float) if exact is None else exact.channel(self.attribute)
             self.kernel.displacement = Displacement(channel, self.heights, scale)
         self.take_scale(self.checked_scale())
 
@@ -120,9 +124,9 @@ class ShapeDisplacement:
     @property
     def channel(self) -> Channel:
         """The channel with its current values, on the host."""
-        if self._channel is None:
-            values = np.array(self._values, dtype=np.float64).reshape(self._loaded.values.shape)
-            self._channel = replace(self._loaded, values=values)
+        if self._updated is not None:
+            values = np.array(self._updated, dtype=np.float64).reshape(self._channel.values.shape)
+            self._channel, self._updated = replace(self._channel, values=values), None
         return self._channel
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -132,9 +136,9 @@ class ShapeDisplacement:
 
     def set_values(self, values: FloatBuffer) -> None:
         """Set values, flat, of the channel that the heights depend on."""
-        self._values, self._channel = dr.detach(values), None
-        if self._own_values is not None:
-            self._own_values.set(values)
+        self._updated = dr.detach(values)
+        if self.kernel is not None and self.kernel.displacement is not None:
+            self.kernel.displacement.channel.values.set(values)
 
     def variables(self) -> list[FloatBuffer]:
         """Differentiable arrays of the heights and the scale."""
@@ -185,20 +189,19 @@ class TextureHeights(Heights):
 
     def __init__(self, variant: Variant, texture: mi.Texture) -> None:
         self._variant, self._texture = variant, texture
+        self._height, self._gradient = partial(self._at, texture.eval_1), partial(self._at, texture.eval_1_grad)
         name = texture.class_name()
         if name in _ELSEWHERE:
             raise ValueError(f'a texture of the kind "{name}" was given; expected {_ELSEWHERE[name]}')
-        self._is_jit = dr.is_jit_v(variant.Float)
-        middle = self._interaction(0.5, 0.5)
         try:
-            texture.eval_1(middle)
+            self._height(0.5, 0.5)
         except RuntimeError as error:
             raise ValueError(
                 f'a texture of the kind "{name}" cannot be evaluated as a single number; expected a scalar texture, '
                 f'such as a bitmap that is "raw" ({error})'
             ) from None
         try:
-            texture.eval_1_grad(middle)
+            self._gradient(0.5, 0.5)
             self._has_gradient = True
         except RuntimeError:
             self._has_gradient = False
@@ -206,18 +209,17 @@ class TextureHeights(Heights):
     def __call__(self, value: Value, du: Value, dv: Value, active: Mask = True) -> tuple[Float, Float, Float]:
         """See `Heights`."""
         s, t = value
-        moves = self._has_gradient and self._is_jit and dr.grad_enabled(s, t)
+        moves = self._has_gradient and dr.is_jit_v(s) and dr.grad_enabled(s, t)
         by_s, by_t = (self._moving_slopes if moves else self._slopes)(s, t, active)
-        return self._at_points(self._height, s, t, active), by_s * du[0] + by_t * du[1], by_s * dv[0] + by_t * dv[1]
+        return self._height(s, t, active), by_s * du[0] + by_t * du[1], by_s * dv[0] + by_t * dv[1]
 
     def height(self, value: Value) -> Float:
         """Heights without derivatives."""
-        s, t = value
-        return self._at_points(self._height, s, t, True)
+        return self._height(*value)
 
     def variables(self) -> list:
         """Differentiable arrays: the differentiable parameters of the texture."""
-        return [value for _, value in mi.traverse(self._texture) if dr.is_diff_v(value)] if self._is_jit else []
+        return [value for _, value in mi.traverse(self._texture) if dr.is_jit_v(value) and dr.is_diff_v(value)]
 
     def range(self, _channel: Channel | None = None) -> tuple[float, float]:
         """Interval of the texels of a bitmap, which contains all heights; for other textures, of samples."""
@@ -228,34 +230,26 @@ class TextureHeights(Heights):
                 values = values @ np.array(_LUMINANCE, dtype=values.dtype)
         else:
             centres = (np.arange(RANGE_SAMPLES) + 0.5) / RANGE_SAMPLES
-            float_type = self._variant.Float if self._is_jit else dr.scalar.ArrayXf64
-            s, t = (mapped(float_type, coordinate) for coordinate in np.meshgrid(centres, centres))
-            values = np.array(self.height((s, t)))
+            float_type = self._variant.Float if dr.is_jit_v(self._variant.Float) else dr.scalar.ArrayXf64
+            values = np.array(self._height(*(mapped(float_type, grid) for grid in np.meshgrid(centres, centres))))
         return float(values.min()), float(values.max())
 
-    def _at_points(self, function: Callable, s: Float, t: Float, active: Mask) -> Value:
-        """Evaluate a function of s and t; point by point in scalar variants."""
-        if self._is_jit or not dr.is_array_v(s):
-            return function(s, t, active)
-        results = np.array([function(*uv, True) for uv in zip(s, t, strict=True)])
-        return type(s)(results) if results.ndim == 1 else [type(s)(column) for column in results.T]
-
-    def _interaction(self, s: Float, t: Float) -> mi.SurfaceInteraction3f:
-        si = dr.zeros(self._variant.SurfaceInteraction3f, max(dr.width(s), dr.width(t)) if self._is_jit else 1)
-        si.uv = self._variant.Point2f(s, t)
-        return si
-
-    def _height(self, s: Float, t: Float, active: Mask) -> Float:
-        return self._texture.eval_1(self._interaction(s, t), active)
+    def _at(self, evaluate: Callable, s: Float, t: Float, active: Mask = True) -> Value:
+        """Call a method of the texture; point by point in scalar variants."""
+        variant, is_jit = self._variant, dr.is_jit_v(self._variant.Float)
+        if not is_jit and dr.is_array_v(s):
+            results = np.array([self._at(evaluate, *uv) for uv in zip(s, t, strict=True)])
+            return type(s)(results) if results.ndim == 1 else [type(s)(column) for column in results.T]
+        si = dr.zeros(variant.SurfaceInteraction3f, max(dr.width(s), dr.width(t)) if is_jit else 1)
+        si.uv = variant.Point2f(s, t)
+        return evaluate(si, active)
 
     def _slopes(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
         """Derivatives of the heights by s and t."""
         if not self._has_gradient:
-            by_differences = not dr.is_diff_v(self._variant.Float)
-            return self._at_points(self._differences if by_differences else self._derivatives, s, t, active)
-        by_s, by_t = self._at_points(
-            lambda s, t, active: self._texture.eval_1_grad(self._interaction(s, t), active), s, t, active
-        )
+            is_diff = dr.is_diff_v(self._variant.Float)
+            return (self._derivatives if is_diff else self._differences)(s, t, active)
+        by_s, by_t = self._gradient(s, t, active)
         # Mitsuba 3.9.1 multiplies the gradient by the resolution after applying ``to_uv`` instead of before, which
         # differs where a bitmap's sides differ in length and ``to_uv`` turns it.
         sides = np.array(self._texture.resolution(), dtype=np.float64)
@@ -313,3 +307,101 @@ class TextureHeights(Heights):
             for step in (DIFFERENCE, -DIFFERENCE)
         )
         return [(a - b) / (2 * DIFFERENCE) for a, b in zip(ahead, behind, strict=True)]
+
+
+class DisplacedVertices:
+    """Displaces the vertices of a tessellation.
+
+    Copies of a vertex along creases and seams are displaced by the mean of their displacements, so that they stay
+    bitwise equal. Each copy has the normal of its side. In JIT variants, differentiable with respect to control points,
+    the scale, and the texture or control values of the heights.
+    """
+
+    def __init__(
+        self,
+        split: AttributeTable,  # Vertices with copies along seams, whose different displacements are averaged
+        weld_target: NDArray[np.uint32] | None,  # Their `split_weld_targets`
+        surface: LimitSurface,
+        displacement: ShapeDisplacement,
+        types: ArrayTypes | None,  # Types of a JIT variant; None in scalar variants
+        *,
+        has_normals: bool,  # Whether normals are needed
+    ) -> None:
+        self._surface, self._displacement, self._has_normals = surface, displacement, has_normals
+        self._types: Any = types
+        # (n,) int64: corner of an element from which parameters are seen, a half-edge of `PatchTable.elements`; and
+        # (n, 2) float64: parameters. Samples at corners of elements have (0, 0).
+        self._corner, self._uv = corner, uv = split.layout.locate()
+        self._mean: Any = None if weld_target is None else _mean_over_copies(weld_target)
+        # (n,) bool: whether the slope of heights along the surface exists. It does not exist at an extraordinary point
+        # where a seam ends, as positions and values contract at different rates.
+        self._has_slope: Any = np.ones(len(corner), dtype=bool)
+        corners = np.flatnonzero((uv == 0).all(axis=1))
+        samples = self._sampler(surface.cage.positions).evaluate(corner[corners], uv[corners])
+        points = corners[samples.level == AT_EXTRAORDINARY_POINT]
+        self._has_slope[points] = contracts_alike(displacement.channel, surface.patches, corner[points])
+        if types is not None:
+            u, v = (types.floats(column) for column in uv.T)
+            self._location = Location(types.indices(corner), u, v)
+            self._has_slope = types.indices(self._has_slope.astype(np.uint32)) != 0
+            dr.eval(self._has_slope)
+            self._mean = self._mean if self._mean is None else SparseMatrix(self._mean, types.float)
+
+    def __call__(
+        self,
+        positions: FloatBuffer,
+        normals: FloatBuffer,
+        points: FloatBuffer,  # Control points of the surface
+    ) -> tuple[FloatBuffer, FloatBuffer]:
+        """Displace flat positions and normals."""
+        if self._types is None:
+            return self._on_host(positions, normals, points)
+        # The displaced surface, which has the control points
+        kernel: Any = self._displacement.kernel
+        displacement, n = kernel.displacement, dr.unravel(self._types.vector3, normals)
+        value, _, _ = displacement.channel(self._location)
+        steps = dr.ravel(displacement.heights.height(value) * displacement.scale * n)
+        positions = positions + (steps if self._mean is None else self._mean(steps, 3))
+        if self._has_normals:
+            displaced_normal = kernel.at(self._location).n
+            exists = self._has_slope & (dr.squared_norm(n) > 0) & (dr.squared_norm(displaced_normal) > 0)
+            normals = dr.ravel(dr.select(exists, displaced_normal, n))
+        return positions, normals
+
+    def _on_host(self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer) -> tuple:
+        displacement, (positions, normals) = self._displacement, (np.reshape(x, (-1, 3)) for x in (positions, normals))
+        rows_of_channel = displacement.channel.with_derivatives(self._corner, self._uv)
+        value, du, dv = (_columns(rows) if rows.shape[1] > 1 else _columns(rows)[0] for rows in rows_of_channel)
+        heights, scale = displacement.heights, displacement.host_scale
+        steps = np.array(heights.height(value))[:, None] * scale * normals
+        positions = positions + (steps if self._mean is None else self._mean @ steps).astype(np.float32)
+        if self._has_normals:
+            h, h_u, h_v = (scale * component for component in heights(value, du, dv))
+            # Second derivatives do not exist at extraordinary points.
+            sampler = self._sampler(np.array(points, dtype=np.float64).reshape(-1, 3))
+            samples = sampler.evaluate(self._corner, self._uv, derivatives=2)
+            p, dp_du, dp_dv, *second = (_columns(rows) for rows in np.nan_to_num([*samples[:3], *samples[5:8]]))
+            surface = PatchValues(p, dp_du, dp_dv, _columns(samples.n), tuple(second))
+            n = unit(displaced(surface, (h, h_u, h_v)).normal)
+            displaced_normal = np.stack([np.array(column) for column in n], axis=1)
+            exists = self._has_slope & normals.any(axis=1) & displaced_normal.any(axis=1)
+            normals = np.where(exists[:, None], displaced_normal, normals).astype(np.float32)
+        return positions.ravel(), normals.ravel()
+
+    def _sampler(self, points: FloatArray) -> PatchSampler:
+        return PatchSampler(self._surface.patches, points, self._surface.cage.cut_mesh.vertex)
+
+
+def _mean_over_copies(weld_target: NDArray[np.uint32]) -> sparse.csr_array:
+    """Matrix that replaces the vector of each vertex by the mean over its copies, from the first copy of each."""
+    from scipy import sparse
+
+    count = len(weld_target)
+    first_copy = sparse.csr_array((np.ones(count), weld_target, np.arange(count + 1)), (count, count))
+    copies = (first_copy @ first_copy.T).sorted_indices()
+    return sparse.csr_array(sparse.diags_array(1 / copies.sum(axis=1)) @ copies)
+
+
+def _columns(rows: NDArray) -> list[Float]:
+    """Columns of an array: vector components for `displaced`."""
+    return [mapped(dr.scalar.ArrayXf64, column) for column in rows.T]

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from ..kernels.surface_kernel import SurfaceKernel
     from ..tessellation.attribute_table import AttributeTable
     from ..tessellation.vertex_table import VertexTable
-    from .displaced_vertices import DisplacedVertices
-    from .displacement import ShapeDisplacement
+    from .displacement import DisplacedVertices, ShapeDisplacement
     from .exact_shading import ExactShading
     from .parameters import Parameters
 
@@ -92,11 +91,10 @@ class MeshBuffers:
         copied, one_of_copies = attributes.layout.surface_vertex, None
         self._displaced: DisplacedVertices | None = None
         if displacement is not None:
-            from .displaced_vertices import DisplacedOnDevice, DisplacedVertices
+            from .displacement import DisplacedVertices
 
             split = parameters.surface.attribute_table(table)
-            displaced_vertices = DisplacedVertices if self._types is None else DisplacedOnDevice
-            self._displaced = displaced_vertices(
+            self._displaced = DisplacedVertices(
                 split,
                 split_weld_targets(table, split),
                 parameters.surface,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 from weakref import WeakMethod
 
@@ -16,7 +17,7 @@ from ..llvm import require_llvm
 from ..surface import TEXCOORDS
 from ..variants import Variant
 from .cage_attributes import PREFIX, CageAttributes, mesh_attributes, mesh_name
-from .device_state import DeviceState, is_recording, paused_collection, traversed
+from .device_state import DeviceState, flat_type, is_recording, paused_collection, traversed
 from .mesh_buffers import MeshBuffers, require_control_points
 from .parameter_table import errors_about, plugin_page
 from .parameters import Parameters, read_parameters
@@ -54,15 +55,14 @@ def make_subdivision(
             if runs_on_llvm:
                 require_llvm()
             parameters = read_parameters(props)
-            surface, is_exact = parameters.surface, _is_exact(parameters, variant)
+            surface, is_exact, kind = parameters.surface, _is_exact(parameters, variant), flat_type(variant)
             self._parameters, self._tessellation = parameters, parameters.tessellation
             # The parameter of an adaptive tessellation's limit.
             error = self._tessellation.error
-            self._error = variant.Float(error) if is_jit else dr.scalar.ArrayXf([error])
+            self._error = kind([error])
             # Dr.Jit's variable indices of the mesh's buffers when they were last set, and their lengths.
             self._evaluated: dict[str, int] = {}
             self._lengths: dict[str, int] = {}
-            kind = variant.Float if is_jit else dr.scalar.ArrayXf
             # Mitsuba samples textured emitters by the mesh's texture coordinates.
             self._has_textured_emitter = _has_textured_emitter(props, variant)
             self._placement = Placement(surface.cage.positions, kind, recentres=parameters.evaluator == "stabilized")
@@ -90,12 +90,13 @@ def make_subdivision(
                     )
             attributes = mesh_attributes(surface.cage)
             exposed = [name for name in (TEXCOORDS, *attributes) if name in surface.attribute_names]
-            self._cage = CageAttributes(variant, surface, exposed, WeakMethod(self.renew_attribute))
-            if self._exact is not None:
-                for name, values in self._exact.values.items():
-                    self._cage.add_follower(name, values.set)
+            values = {} if self._exact is None else self._exact.values
+            followers: dict[str, Callable] = {name: of_channel.set for name, of_channel in values.items()}
+            displaces = None if self._displacement is None else self._displacement.attribute
             if self._displacement is not None:
-                self._cage.add_follower(self._displacement.attribute, self._displacement.set_values, moves=True)
+                followers[self._displacement.attribute] = self._displacement.set_values
+            on_backward = WeakMethod(self.renew_attribute)
+            self._cage = CageAttributes(variant, surface, exposed, followers, displaces, on_backward)
             self.control_points = mapped(kind, surface.cage.positions)
             if is_jit:
                 # Copied to Dr.Jit's own memory, as frozen functions replace the array.
