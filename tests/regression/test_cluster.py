@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
-from mitsuba_subdivision.commands import pictures
+from mitsuba_subdivision.commands import render
 from mitsuba_subdivision.regression import RegressionError
 from mitsuba_subdivision.regression.passes import Sampling, merge_passes, render_on_cluster, render_pass
 from mitsuba_subdivision.regression.scene import load_scene
@@ -63,7 +63,7 @@ def test_frames_and_passes_of_a_model_have_the_bits_of_one_machine_although_a_wo
     )
     monkeypatch.chdir(tmp_path)
     common = ["render", "model.usda", "--size", "16x12", "--spp", "4", "--filter", "box", "-m", "scalar_rgb"]
-    monkeypatch.setattr(pictures, "_frame", partial(frame_after_a_death, pictures._frame, tmp_path / "died"))
+    monkeypatch.setattr(render, "_frame", partial(frame_after_a_death, render._frame, tmp_path / "died"))
     told = {}
     for name, where in (("together", ["--dask", address]), ("alone", [])):
         assert main([*common, "--frames", "1:3", "-o", f"{name}.exr", *where]) == 0

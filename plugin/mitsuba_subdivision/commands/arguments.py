@@ -14,7 +14,7 @@ from ..tessellation import HIGHEST_RATE
 # Exit status of wrong usage, as argparse has it.
 USAGE_ERROR = 2
 
-N = TypeVar("N", int, float)
+V = TypeVar("V")
 
 
 def add_variant(parser: argparse.ArgumentParser, *aliases: str) -> None:
@@ -32,13 +32,13 @@ def add_cage_options(parser: argparse._ActionsContainer, default_rate: str) -> N
     add("--rate", type=rate, metavar="N", help=f"segments per edge of the cage (default: {default_rate})")
 
 
-def number(kind: Callable[[str], N], is_allowed: Callable[[N], bool], expected: str) -> Callable[[str], N]:
-    """Make the parser of an argument that is a number, and of which messages say what was expected."""
+def checked(kind: Callable[[str], V], is_allowed: Callable[[V], bool], expected: str) -> Callable[[str], V]:
+    """Make the parser of an argument's values, which says what was expected in place of others."""
 
-    def parsed(text: str) -> N:
+    def parsed(text: str) -> V:
         try:
             value = kind(text)
-        except ValueError:
+        except (TypeError, ValueError):
             value = None
         if value is None or not is_allowed(value):
             raise argparse.ArgumentTypeError(f'"{text}"; expected {expected}')
@@ -47,33 +47,13 @@ def number(kind: Callable[[str], N], is_allowed: Callable[[N], bool], expected: 
     return parsed
 
 
-def _integer(text: str) -> int:
-    if not text.isdecimal():
-        raise ValueError(text)
-    return int(text)
-
-
-finite = number(float, math.isfinite, "a number")
-above_zero = number(float, lambda value: 0 < value < math.inf, "a number above 0")
-index = number(_integer, lambda _: True, "an integer, 0 or more")
+finite = checked(float, math.isfinite, "a number")
+above_zero = checked(float, lambda value: 0 < value < math.inf, "a number above 0")
+index = checked(int, lambda value: value >= 0, "an integer, 0 or more")
+positive = checked(int, lambda value: value >= 1, "an integer, 1 or more")
 # Of 32 bits, as Mitsuba has it.
-seed = number(_integer, lambda value: value < 2**32, f"an integer from 0 to {2**32 - 1}")
-
-
-def positive(text: str) -> int:
-    """Parse an argument that is an integer of at least 1."""
-    value = number(int, lambda _: True, "an integer, 1 or more")(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value}; expected 1 or more")
-    return value
-
-
-def rate(text: str) -> int:
-    """Parse a tessellation rate."""
-    value = positive(text)
-    if value > HIGHEST_RATE:
-        raise argparse.ArgumentTypeError(f"{value}; expected {HIGHEST_RATE} or less")
-    return value
+seed = checked(int, lambda value: 0 <= value < 2**32, f"an integer from 0 to {2**32 - 1}")
+rate = checked(int, lambda value: 1 <= value <= HIGHEST_RATE, f"an integer from 1 to {HIGHEST_RATE}")
 
 
 class CommandParser(argparse.ArgumentParser):

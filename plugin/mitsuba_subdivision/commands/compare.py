@@ -12,7 +12,7 @@ from ..regression import RegressionError
 from ..regression.tiers import DEFAULT_TIERS, TIERS, Tolerances
 from ..variants import variant_set
 from ..whole_file import require_folder, require_writable, write_text
-from .arguments import CommandParser, positive, seed, table
+from .arguments import CommandParser, checked, positive, seed, table
 
 # Exit status of ``compare`` and ``merge`` for input or output that cannot be used: 1 and 2 say how images differ.
 UNUSABLE = 3
@@ -50,19 +50,17 @@ def merge(parser: CommandParser) -> None:
     parser.set_defaults(run=_merge, error_status=UNUSABLE, usage_status=UNUSABLE)
 
 
+def _tolerance(text: str) -> tuple[str, float]:
+    name, value = text.split("=", 1)
+    return name, float(value)
+
+
 def add_tolerances(group: argparse._ActionsContainer, text: str) -> None:
     """Add the option ``--tolerance``, with a text for the help."""
+    kind = checked(_tolerance, lambda _: True, "NAME=NUMBER")
     group.add_argument(
-        "--tolerance", dest="tolerances", metavar="NAME=VALUE", type=_tolerance, action="append", default=[], help=text
+        "--tolerance", dest="tolerances", metavar="NAME=VALUE", type=kind, action="append", default=[], help=text
     )
-
-
-def _tolerance(text: str) -> tuple[str, float]:
-    name, _, value = text.partition("=")
-    try:
-        return name, float(value)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f'"{text}"; expected NAME=NUMBER') from None
 
 
 def _compare(options: argparse.Namespace) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from pathlib import Path
 
 from ..figures import FIGURES, FigureOptions, require_options
@@ -12,7 +11,7 @@ from ..messages import print_result
 from ..schemes import SCHEME_CLASSES
 from ..variants import set_variant
 from ..whole_file import require_folder, require_writable
-from .arguments import CommandParser, add_variant, positive, table
+from .arguments import CommandParser, add_variant, checked, positive, table
 
 # Ignored by git: pictures of the pages lie beside it, in renders/figures, and another processor draws other last bits.
 DRAWN = Path("renders/drawn")
@@ -62,12 +61,12 @@ def _figure(options: argparse.Namespace) -> None:
                 print_result(path)
 
 
-def _width(text: str) -> float:
-    """Parse a width in millimetres or inches; returns millimetres."""
-    try:
-        length = INCH * float(text.removesuffix("in")) if text.endswith("in") else float(text.removesuffix("mm"))
-    except ValueError:
-        length = math.nan
-    if not COLUMN <= length <= WIDEST:
-        raise argparse.ArgumentTypeError(f'"{text}"; expected a width from {COLUMN:g}mm to {WIDEST:g}mm, or in inches')
-    return length
+def _millimetres(text: str) -> float:
+    return INCH * float(text.removesuffix("in")) if text.endswith("in") else float(text.removesuffix("mm"))
+
+
+_width = checked(
+    _millimetres,
+    lambda width: COLUMN <= width <= WIDEST,
+    f"a width from {COLUMN:g}mm to {WIDEST:g}mm, or in inches",
+)

@@ -1,31 +1,40 @@
-"""The command ``render``: Mitsuba scenes, and models in the studio."""
+"""The command ``render``: Mitsuba scenes, and models in the studio, here or on the workers of a cluster."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import re
-from collections.abc import Iterator, Sequence
+import pickle
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import lru_cache, partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cage.errors import CageWarning, warn
 from ..files.formats import FORMATS
 from ..messages import counted, print_remark, print_result
 from ..regression.image import METADATA_ATTRIBUTE
-from ..regression.scene import BOX, kept_search_folders, load_scene
+from ..regression.scene import BOX, LoadedScene, kept_search_folders, load_scene, render_image
+from ..regression.tiers import Tolerances
 from ..shapes.parameter_table import SHADINGS
-from ..studio.picture import require_denoiser
-from ..studio.studio_entries import DEFAULT_VIEW, UP_AXES, VIEWS
-from ..variants import set_variant
+from ..studio.animation import FrameRange, StillPicture, Turntable
+from ..studio.cage_scenes import CageScenes
+from ..studio.picture import denoised, require_denoiser, shading_for
+from ..studio.saving import save_scene
+from ..studio.studio_entries import DEFAULT_VIEW, UP_AXES, VIEWS, Look, sampler, variant_in_use
+from ..variants import set_variant, threads_set
 from ..whole_file import require_writable, whole_file
-from .arguments import CommandParser, above_zero, add_cage_options, add_variant, finite, index, positive, seed
+from .arguments import CommandParser, above_zero, add_cage_options, add_variant, checked, finite, index, positive, seed
 from .compare import TOLERANCES, add_tolerances
-from .pictures import pictures, render_by_passes, render_picture
 
 IMAGE_SUFFIXES = (".exr", ".png", ".jpg", ".hdr")
 VIDEO_SUFFIXES = (".gif", ".mp4")
@@ -37,10 +46,33 @@ _OF_MODELS = (
     "texture_size",
 )  # fmt: skip
 _OF_FRAMES = ("turntable", "frames", "shutter", "fps")
+# Options that select one mesh of a USD file.
+_OF_ONE_MESH = ("up", "scheme", "prim", "checker", "cage")
 # Options that do not apply to a model's scene.
 _OF_SCENES = ("parameters", "sensor", "share", "reference", "tolerances")
 # Sides of the pictures in an MP4 file are multiples of this; others lose a row or a column.
 EVEN = 2
+
+
+def _sides(text: str) -> tuple[int, int]:
+    width, height = map(int, text.split("x"))
+    return width, height
+
+
+def _numbers(text: str) -> range:
+    first, last, *step = map(int, text.split(":"))
+    return range(first, last + 1, *step)
+
+
+def _one_of_many(text: str) -> tuple[int, int]:
+    number, count = map(int, text.split("/"))
+    return number, count
+
+
+_size = checked(_sides, lambda size: min(size) > 0, "width and height of 1 or more, such as 1280x720")
+_frame_range = checked(_numbers, lambda numbers: len(numbers) > 0, "FIRST:LAST or FIRST:LAST:STEP, such as 1:24")
+_share = checked(_one_of_many, lambda share: 1 <= share[0] <= share[1], "I/N with I from 1 to N, such as 2/8")
+_assignment = checked(lambda text: text.split("=", 1), lambda pair: len(pair) == 2 and pair[0] != "", "NAME=VALUE")
 
 
 def render(parser: CommandParser) -> None:
@@ -65,19 +97,8 @@ def render(parser: CommandParser) -> None:
     add("-t", "--threads", type=positive, metavar="N", help="threads to render with (default: all)")
     add("-a", "--append", metavar="PATHS", help='folders to search for files, separated by ";"', **many)
     add("-v", "--verbose", action="count", default=0, help="print messages of Mitsuba; repeat for more")
-    _add_model_options(parser.add_argument_group("models"))
-    text = (
-        "Frames are written as NAME_0001.png and so on. Existing frames are kept, so that an interrupted command can "
-    )
-    _add_frame_options(parser.add_argument_group("frames of models", f"{text}be repeated."))
-    add("--filter", help='reconstruction filter instead of the scene\'s; "box" is deterministic')
-    text = "The image is an OpenEXR file with the variance and the number of samples of each pixel."
-    _add_pass_options(parser.add_argument_group("rendering by passes", text))
-    parser.set_defaults(run=_render)
-
-
-def _add_model_options(group: argparse._ArgumentGroup) -> None:
-    add = group.add_argument
+    models = parser.add_argument_group("models")
+    add = models.add_argument
     add("--view", choices=list(VIEWS), help=f"view of the camera (default: {DEFAULT_VIEW})")
     add("--azimuth", type=finite, metavar="DEG", help="azimuth instead of --view: front 0, +x 90")
     add("--elevation", type=finite, metavar="DEG", help="elevation above the ground instead of --view, -90 to 90")
@@ -88,24 +109,26 @@ def _add_model_options(group: argparse._ArgumentGroup) -> None:
     add("--texture-size", type=positive, metavar="N", help=text)
     add("--checker", action="store_true", help="show texture coordinates as a checkerboard")
     add("--cage", action="store_true", help="draw the control cage")
-    add_cage_options(group, "as many as the picture needs")
+    add_cage_options(models, "as many as the picture needs")
     text = "normals: interpolated between vertices, or exact (default: auto, exact where supported)"
     add("--shading", choices=SHADINGS, help=text)
     add("--save-scene", type=Path, metavar="FILE", help="also write the scene as XML, which can be edited and rendered")
-
-
-def _add_frame_options(group: argparse._ArgumentGroup) -> None:
-    add = group.add_argument
+    text = (
+        "Frames are written as NAME_0001.png and so on. Existing frames are kept, so that an interrupted command can "
+        "be repeated."
+    )
+    add = parser.add_argument_group("frames of models", text).add_argument
     add("--turntable", type=positive, metavar="N", help="turn the model around once, in N frames")
     text = "times of a USD file, or numbers of files whose name has %%04d in it"
     add("--frames", type=_frame_range, metavar="FIRST:LAST[:STEP]", help=text)
     text = "motion blur of a USD file: mean of N times while the shutter of its camera is open (default: none)"
     add("--shutter", type=positive, metavar="N", help=text)
     add("--fps", type=above_zero, metavar="N", help=f"frames per second of a video (default: {DEFAULT_FPS})")
-
-
-def _add_pass_options(group: argparse._ArgumentGroup) -> None:
-    add = group.add_argument
+    text = 'reconstruction filter instead of the scene\'s; "box" is deterministic'
+    parser.add_argument("--filter", help=text)
+    text = "The image is an OpenEXR file with the variance and the number of samples of each pixel."
+    passes = parser.add_argument_group("rendering by passes", text)
+    add = passes.add_argument
     add("--pass", dest="share", type=_share, metavar="I/N", help='render only pass I of N; "merge" puts them together')
     add("--passes", type=positive, metavar="N", help="render N passes one after the other, and merge")
     text = "render the passes, or the frames of a model, on the Dask cluster of this scheduler"
@@ -113,7 +136,8 @@ def _add_pass_options(group: argparse._ArgumentGroup) -> None:
     add("--batch", type=positive, metavar="N", help="samples per pixel that are rendered with one seed (default: 64)")
     text = 'write a reference for "compare": with the box filter, geometry AOVs and tolerances'
     add("--reference", action="store_true", help=text)
-    add_tolerances(group, "tolerance to store with the reference; can be repeated")
+    add_tolerances(passes, "tolerance to store with the reference; can be repeated")
+    parser.set_defaults(run=_render)
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -125,18 +149,17 @@ def _render(options: argparse.Namespace) -> None:
     # A worker of a cluster renders a frame as a whole.
     on_cluster = options.dask and not (options.frames or options.turntable or options.shutter)
     by_passes = bool(options.share or options.passes or options.reference or on_cluster)
-    _validate(options, is_model)
-    _validate_passes(options, by_passes)
+    _require_effect(options, is_model)
+    _refuse_contradictions(options, by_passes)
     if options.denoise:
         require_denoiser()
         options.filter = BOX
-    _validate_output(options)
     set_variant(options.variant)
     with _settings(options):
         (_render_model if is_model else _render_scene)(options, by_passes)
 
 
-def _validate(options: argparse.Namespace, is_model: bool) -> None:
+def _require_effect(options: argparse.Namespace, is_model: bool) -> None:
     """Refuse options that have no effect with this input."""
     what, useless = ("model", _OF_SCENES) if is_model else ("scene", (*_OF_MODELS, *_OF_FRAMES, "save_scene"))
     other = "a Mitsuba scene, which --save-scene writes" if is_model else "a model"
@@ -149,11 +172,12 @@ def _validate(options: argparse.Namespace, is_model: bool) -> None:
             raise ValueError(f'{flag} was given for the {what} "{options.scene}"; expected it for {other}')
 
 
-def _validate_passes(options: argparse.Namespace, by_passes: bool) -> None:
-    """Refuse options for passes that contradict each other, or have no effect with the others."""
+def _refuse_contradictions(options: argparse.Namespace, by_passes: bool) -> None:
+    """Refuse outputs of an unknown kind, and options that contradict each other or have no effect with the others."""
+    suffix, has_frames = options.output.suffix.lower(), options.turntable or options.frames
     has_other_filter = options.filter not in (None, BOX)
     all_options = "--pass, --passes, --dask or --reference"
-    if by_passes and options.output.suffix.lower() != ".exr":
+    if by_passes and suffix != ".exr":
         raise ValueError(f'output "{options.output}"; expected a name ending in .exr, which keeps the variance')
     if options.share and (options.passes or options.dask):
         raise ValueError("--pass renders one pass, --passes and --dask render all; expected one of them")
@@ -170,11 +194,6 @@ def _validate_passes(options: argparse.Namespace, by_passes: bool) -> None:
         raise ValueError(f"--batch is for passes; expected {all_options} beside it")
     if options.tolerances and not options.reference:
         raise ValueError("--tolerance is stored with a reference; expected --reference beside it")
-
-
-def _validate_output(options: argparse.Namespace) -> None:
-    """Refuse outputs of an unknown kind, and options for frames that contradict each other."""
-    suffix, has_frames = options.output.suffix.lower(), options.turntable or options.frames
     known = (*IMAGE_SUFFIXES, *(VIDEO_SUFFIXES if has_frames else ()))
     if suffix not in known:
         more = ", or --turntable or --frames for a video" if suffix in VIDEO_SUFFIXES else ""
@@ -214,7 +233,7 @@ def _render_scene(options: argparse.Namespace, by_passes: bool) -> None:
     if options.scene.is_file():  # Otherwise loading refuses the scene, before a folder is made.
         require_writable(options.output, [options.scene])
     if by_passes:
-        render_by_passes(options)
+        _render_by_passes(options)
         return
     loaded = load_scene(options.scene, dict(options.parameters), options.filter, options.sensor or 0)
     require_writable(options.output, loaded.file_paths)
@@ -222,7 +241,7 @@ def _render_scene(options: argparse.Namespace, by_passes: bool) -> None:
         raise ValueError(f'scene "{options.scene}" has no integrator; expected one')
     if options.output.suffix.lower() != ".exr" and loaded.scene.integrator().aov_names():
         raise ValueError(f'output "{options.output}"; expected a name ending in .exr, as the integrator has AOVs')
-    _write_image(options, render_picture(options, [loaded], options.spp), options.output)
+    _write_image(options, _render_picture(options, [loaded], options.spp), options.output)
 
 
 def _render_model(options: argparse.Namespace, by_passes: bool) -> None:
@@ -232,11 +251,11 @@ def _render_model(options: argparse.Namespace, by_passes: bool) -> None:
             raise FileNotFoundError(f'"{options.scene}": there is no such file; expected a model{hint}')
         require_writable(options.output, [options.scene])
     if by_passes:
-        render_by_passes(options, is_model=True)
+        _render_by_passes(options, is_model=True)
     elif options.frames or options.turntable:
         _write_frames(options)
     else:
-        _, image = next(pictures(options, [1]))
+        _, image = next(_pictures(options, [1]))
         _write_image(options, image, options.output)
 
 
@@ -253,7 +272,7 @@ def _write_frames(options: argparse.Namespace) -> None:
     if len(missing) < len(paths):
         there = len(paths) - len(missing)
         print_remark(f"{there} of {len(paths)} frames exist and are kept; remove them to render them again")
-    rendered = pictures(options, missing)
+    rendered = _pictures(options, missing)
     for _ in counted(missing, "Frames"):
         number, image = next(rendered)
         _write_image(options, image, paths[number])
@@ -272,33 +291,148 @@ def _write_image(options: argparse.Namespace, image: NDArray[np.float32], path: 
     print_result(path)
 
 
-def _size(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d+)x(\d+)", text)
-    if not match or not all(map(int, match.groups())):
-        raise argparse.ArgumentTypeError(f'"{text}"; expected width and height of 1 or more, such as 1280x720')
-    return int(match[1]), int(match[2])
+def _render_picture(
+    options: argparse.Namespace, scenes: Iterable[LoadedScene], spp: int | None = None
+) -> NDArray[np.float32]:
+    """Render a scene, or the mean of the scenes of a frame's sub-frames, which share no samples."""
+    count = options.shutter or 1
+    total: Any = 0.0
+    for part, loaded in enumerate(scenes):
+        seed = (options.seed * count + part) % 2**32
+        with threads_set(options.threads):
+            image = render_image(loaded, spp or loaded.sensor.sampler().sample_count(), seed)
+            if options.denoise:
+                # Each by itself, as its albedo and normals are those of its time.
+                image = denoised(loaded, image, seed)
+        total = total + image / count
+    return total
 
 
-def _frame_range(text: str) -> range:
-    match = re.fullmatch(r"(-?\d+):(-?\d+)(?::(\d+))?", text)
-    step = int(match[3] or 1) if match else 0
-    if not match or not step or int(match[1]) > int(match[2]):
-        raise argparse.ArgumentTypeError(f'"{text}"; expected FIRST:LAST or FIRST:LAST:STEP, such as 1:24')
-    return range(int(match[1]), int(match[2]) + 1, step)
+def _pictures(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    """Frames of a model, or its picture as number 1, with their numbers, as they are finished."""
+    if options.dask:
+        return _on_cluster(options, numbers)
+    shown = _shown(options)
+    if options.save_scene:
+        save_scene(shown.scene, options.save_scene, [options.scene])
+    scenes = shown.frames(numbers, options.filter)
+    return ((number, _render_picture(options, islice(scenes, options.shutter or 1))) for number in numbers)
 
 
-def _assignment(text: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not (name and equals):
-        raise argparse.ArgumentTypeError(f'"{text}"; expected NAME=VALUE')
-    return name, value
+def _render_by_passes(options: argparse.Namespace, *, is_model: bool = False) -> None:
+    """Render by passes, in the current variant, here or on a cluster, and write the image.
+
+    Raises RegressionError if there are fewer batches than passes, or no cluster answers.
+    """
+    from ..regression.image import save_image
+    from ..regression.passes import BATCH, LEAST_BATCHES, Sampling, merge_passes, render_on_cluster, render_pass
+    from ..regression.references import REFERENCE_SPP, as_reference
+
+    # Workers get it, too, and may be in another folder.
+    load: Callable[[], LoadedScene] = partial(_load_still, _as_data(options))
+    if not is_model:
+        path = options.scene.resolve() if options.dask else options.scene
+        load = partial(load_scene, path, dict(options.parameters), BOX if options.reference else options.filter)
+    loaded = load()
+    require_writable(options.output, loaded.file_paths)
+    spp = options.spp or (REFERENCE_SPP if options.reference else loaded.sensor.sampler().sample_count())
+    tolerances = Tolerances().with_values(dict(options.tolerances))
+    number, count = options.share or (1, options.passes or 1)
+    batch = options.batch or min(BATCH, max(1, spp // max(LEAST_BATCHES, count)))
+    if is_model:
+        # Mitsuba would round each batch up, and more samples than recorded would count.
+        batch = sampler(batch)["sample_count"]
+    sampling = Sampling(max(1, -(-spp // batch)), batch, options.seed)
+    settings = {"with_probe": options.reference}
+    with threads_set(options.threads):
+        if options.dask:
+            variant = str(mi.variant())
+            image = render_on_cluster(options.dask, load, variant, sampling, options.passes or 0, **settings)
+        elif options.share:
+            image = render_pass(loaded, sampling, number, count, **settings)
+        else:
+            image = merge_passes([render_pass(loaded, sampling, i, count, **settings) for i in range(1, count + 1)])
+    if options.reference:
+        image = as_reference(image, options.scene, options.output, sampling, tolerances)
+    save_image(options.output, image)
+    print_result(options.output)
 
 
-def _share(text: str) -> tuple[int, int]:
-    number, _, count = text.partition("/")
-    if not (number.isdigit() and count.isdigit() and 1 <= int(number) <= int(count)):
-        raise argparse.ArgumentTypeError(f'"{text}"; expected I/N with I from 1 to N, such as 2/8')
-    return int(number), int(count)
+def _as_data(options: argparse.Namespace) -> dict[str, Any]:
+    """Options by which another process, in another folder, renders the same pictures."""
+    given = {name: value for name, value in vars(options).items() if name not in ("run", "parser")}
+    return given | {"scene": options.scene.resolve()}
+
+
+def _load_still(given: dict[str, Any]) -> LoadedScene:
+    """The scene of a model's picture, by options `_as_data`."""
+    options = argparse.Namespace(**given)
+    return next(_shown(options).frames([1], options.filter))
+
+
+def _on_cluster(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float32]]]:
+    from ..regression.passes import cluster, results
+
+    # The command's own number: files may change until the next one.
+    command = pickle.dumps(_as_data(options) | {"command": uuid4().hex})
+    warned: set[str] = set()
+    with cluster(options.dask) as client:
+        for number, (image, messages) in results(client, partial(_frame, command), str(mi.variant()), numbers):
+            for message in dict.fromkeys(messages):
+                if message not in warned:
+                    warn(message)
+            warned.update(messages)
+            yield number, image
+
+
+def _frame(command: bytes, number: int) -> tuple[NDArray[np.float32], list[str]]:
+    """A picture, and the messages of warnings; runs on a worker."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CageWarning)
+        options, shown = _kept(command)
+        image = _render_picture(options, shown.frames([number], options.filter))
+    return image, [str(warning.message) for warning in caught if issubclass(warning.category, CageWarning)]
+
+
+@lru_cache(maxsize=1)
+def _kept(command: bytes) -> tuple[argparse.Namespace, FrameRange | Turntable | StillPicture]:
+    """Options and what they show: a worker reads it once for all of its frames."""
+    options = argparse.Namespace(**pickle.loads(command))
+    return options, _shown(options)
+
+
+def _shown(options: argparse.Namespace) -> FrameRange | Turntable | StillPicture:
+    """What a model's pictures show."""
+    source = _source(options)
+    if options.frames or options.shutter:
+        return FrameRange(source, options.frames or range(1, 2))
+    if options.turntable:
+        return Turntable(source, options.turntable, follows_sensor=not options.save_scene)
+    return StillPicture(source, follows_sensor=not options.save_scene)
+
+
+def _source(options: argparse.Namespace) -> Any:
+    """Scene source of one mesh, or of a whole USD file."""
+    azimuth, elevation = VIEWS[options.view or DEFAULT_VIEW]
+    azimuth = azimuth if options.azimuth is None else options.azimuth
+    elevation = elevation if options.elevation is None else options.elevation
+    chosen = {name: getattr(options, name) for name in ("up", "size", "spp", "rate", "checker", "cage", "texture_size")}
+    look = Look(view=(azimuth, elevation), **{name: value for name, value in chosen.items() if value is not None})
+    which = {"time": options.time, "numbers": options.frames}
+    is_usd = options.scene.suffix.lower().startswith(".usd")
+    if is_usd and not any(getattr(options, name) for name in _OF_ONE_MESH):
+        from mitsuba_usd import StageScenes
+
+        given = {"tessellation_rate": options.rate, "shading": options.shading}
+        parameters = {name: value for name, value in given.items() if value is not None}
+        return StageScenes(options.scene, look, parameters, shutter=options.shutter, **which)
+    what = f'one cage of "{options.scene}"'
+    if options.shutter:
+        raise ValueError(f"--shutter was given for {what}, which has no camera; expected a whole USD file")
+    if options.texture_size:
+        raise ValueError(f"--texture-size was given for {what}; expected it for a whole USD file")
+    shading = shading_for(variant_in_use(), {"shading": options.shading or "auto"})
+    return CageScenes(options.scene, replace(look, shading=shading), prim=options.prim, scheme=options.scheme, **which)
 
 
 def _require_encoder(path: Path) -> None:
