@@ -1,0 +1,129 @@
+"""Samples of surfaces of every kind are limit stencils times control points, and vertices of tessellations samples."""
+
+import numpy as np
+import pytest
+from evaluation.common import evaluate_from
+from kernels.surfaces import SURFACES, random_locations, surface_named
+from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
+from mitsuba_subdivision.patches import patch_samples
+from mitsuba_subdivision.tessellation import Criterion, Measure
+from patches.closed_cages import bumpy
+from reference.refined_cages import refine_first
+
+pytestmark = pytest.mark.core
+
+EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
+# Of sums of some tens of terms; around vertices of valence 50 of ill-conditioned eigenvectors.
+ROUNDED, NORMAL = 1e-13, 1e-10
+# Of derivatives, in sums of the absolute values of their terms where these are above one.
+DERIVATIVE = 1e-12
+# Odd and even, and halves of these odd and even: two of them for each surface.
+RATES = (1, 6), (2, 5), (3, 4)
+
+
+def locations(surface, rng, count=600):
+    """All over the surface, near corners down to 1e-12 of an element and below, and at them."""
+    element, uv, corner = random_locations(surface, rng, count)
+    third = count // 3
+    uv[:third] *= 10.0 ** rng.uniform(-12, 0, (third, 1))
+    uv[:20], uv[20:30] = 0, uv[20:30] * 1e-200
+    uv[30:50, 0], uv[50:70] = 0, (1, 0)
+    return element, uv, corner
+
+
+def close(computed, expected, size, atol=ROUNDED):
+    np.testing.assert_allclose(computed, expected, rtol=0, atol=atol * size)
+
+
+def assert_applied(matrix, points, expected, rounded=ROUNDED):
+    """Rows of weights times points are these values, also in which of them are no numbers."""
+    terms = abs(matrix) @ np.abs(points)
+    np.testing.assert_array_equal(np.isnan(terms), np.isnan(expected))
+    known = np.isfinite(terms)
+    assert (np.abs(matrix @ points - expected)[known] <= rounded * np.maximum(terms, 1)[known]).all()
+
+
+@EVERY_SURFACE
+def test_samples_are_limit_stencils_applied_and_first_levels_as_eigencoordinates_have_them(name, np_rng):
+    surface = surface_named(name)
+    where, points = locations(surface, np_rng), surface.cage.positions
+    samples, weights = surface.evaluate(*where), surface.matrix(*where, derivatives=2)
+    # With second derivatives, no level is a piece.
+    expected = surface.evaluate(*where, derivatives=2)
+    close(weights.p.sum(axis=1), 1, 1)
+    for column, matrix in weights._asdict().items():
+        assert_applied(matrix, points, getattr(expected, column), ROUNDED if column == "p" else DERIVATIVE)
+        if column != "p":
+            assert_applied(matrix, np.ones(len(points)), 0 * matrix.sum(axis=1), DERIVATIVE)
+    for column in ("dp_du", "dp_dv"):
+        assert_applied(getattr(weights, column), points, getattr(samples, column), DERIVATIVE)
+    np.testing.assert_array_equal(samples.level, expected.level)
+    close(samples.p, expected.p, np.abs(points).max())
+    close(samples.n, expected.n, 1, NORMAL)
+    np.testing.assert_array_equal((samples.n == 0).all(axis=1), (expected.n == 0).all(axis=1))
+
+
+@EVERY_SURFACE
+def test_samples_do_not_depend_on_others(name, np_rng, monkeypatch):
+    surface = surface_named(name)
+    where = locations(surface, np_rng, 90)
+    expected, size = surface.evaluate(*where), np.abs(surface.cage.positions).max()
+
+    def check(chosen):
+        samples = surface.evaluate(*(values[chosen] for values in where))
+        close(samples.p, expected.p[chosen], size)
+        close(samples.n, expected.n[chosen], 1, NORMAL)
+        np.testing.assert_array_equal(samples.level, expected.level[chosen])
+
+    for chosen in (slice(None, None, -1), slice(0, 1), slice(5, 6), slice(40, 43)):
+        check(chosen)
+    # In short runs.
+    monkeypatch.setattr(patch_samples, "WEIGHTS", 70)
+    check(slice(None))
+
+
+def assert_vertices_are_samples(surface, table):
+    """And a matrix times the control points; both sides of a crease have the same points, bit by bit."""
+    control_points = surface.cage.positions
+    (points, normals), size = table.apply(control_points), np.abs(control_points).max()
+    expected, weights = surface._sampler.evaluate(*table.locations()), surface.tessellation_matrix(table)
+    close(points, expected.p, size)
+    close(normals, expected.n, 1, NORMAL)
+    has_normal = normals.any(axis=1)
+    close(np.linalg.norm(normals[has_normal], axis=1), 1, 1)
+    np.testing.assert_array_equal(has_normal, expected.n.any(axis=1))
+    np.testing.assert_array_equal(points, points[table.weld_target])
+    np.testing.assert_array_equal(np.unique(table.triangles), np.arange(table.vertex_count))
+    close(weights.p @ control_points, points, size)
+    close(weights.p.sum(axis=1), 1, 1)
+    assert (weights.p[table.copies[0]] != weights.p[table.copies[1]]).nnz == 0
+    crosses = np.cross(*((tangent @ control_points)[has_normal] for tangent in weights[1:]))
+    close(crosses / np.linalg.norm(crosses, axis=1, keepdims=True), normals[has_normal], 1, NORMAL)
+
+
+@EVERY_SURFACE
+def test_vertices_are_samples_where_they_say(name, monkeypatch):
+    surface = surface_named(name)
+    for rate in RATES[list(SURFACES).index(name) % len(RATES)]:
+        assert_vertices_are_samples(surface, surface.sampling(rate))
+    chord = 0.03 * np.ptp(surface.cage.positions, axis=0).max()
+    assert_vertices_are_samples(surface, surface.adaptive_sampling(Criterion(Measure.CHORD, chord)))
+    refine_first(monkeypatch)
+    refined = LimitSurface(surface.cage, surface.scheme)
+    if refined.patches.refined is not None:
+        assert_vertices_are_samples(refined, refined.sampling(3))
+
+
+@pytest.mark.parametrize("valence", [3, 5, 7])
+@pytest.mark.parametrize(("make", "scheme"), [(extraordinary, "catmull_clark"), (extraordinary_triangles, "loop")])
+def test_normals_tend_to_that_of_the_extraordinary_vertex(make, scheme, valence):
+    surface = LimitSurface(bumpy(make(valence)), scheme)
+    start = np.flatnonzero(surface.patches.elements.face_vertices == 0)
+    at = evaluate_from(surface, start, [[0.0, 0.0]])
+    close(at.n, np.broadcast_to(at.n[0], at.n.shape), 1, NORMAL)
+    for size in (1e-12, 1e-100):
+        near = evaluate_from(surface, start, [[size, size]])
+        # The slower the more faces there are.
+        close(near.n, at.n, 1, NORMAL if size == 1e-100 else 1e-3)
+        np.testing.assert_allclose(np.linalg.norm(near.n, axis=1), 1, rtol=1e-12)
