@@ -18,21 +18,21 @@ EXTENSION = "MIRROR" if bpy.app.version >= (3, 5) else "EXTEND"
 
 def image(name, value, folder, *, is_data=False, is_float=False, is_packed=False):
     """An image whose texels are a function of their place, from 0 to 1, in a file or packed into the scene."""
-    found = bpy.data.images.new(name, TEXELS, TEXELS, alpha=True, float_buffer=is_float)
+    picture = bpy.data.images.new(name, TEXELS, TEXELS, alpha=True, float_buffer=is_float)
     if is_data:
-        found.colorspace_settings.name = "Non-Color"
+        picture.colorspace_settings.name = "Non-Color"
     places = [(i + 0.5) / TEXELS for i in range(TEXELS)]
     texels = [value(u, v) for v in places for u in places]
-    found.pixels.foreach_set([number for texel in texels for number in (*texel, 1.0)[:4]])
-    found.update()
+    picture.pixels.foreach_set([number for texel in texels for number in (*texel, 1.0)[:4]])
+    picture.update()
     if is_packed:
-        found.pack()
-        return found
-    found.file_format = "OPEN_EXR" if is_float else "PNG"
-    found.filepath_raw = os.path.join(folder, name + (".exr" if is_float else ".png"))
-    found.save()
-    loaded = bpy.data.images.load(found.filepath_raw)
-    loaded.colorspace_settings.name = found.colorspace_settings.name
+        picture.pack()
+        return picture
+    picture.file_format = "OPEN_EXR" if is_float else "PNG"
+    picture.filepath_raw = os.path.join(folder, name + (".exr" if is_float else ".png"))
+    picture.save()
+    loaded = bpy.data.images.load(picture.filepath_raw)
+    loaded.colorspace_settings.name = picture.colorspace_settings.name
     return loaded
 
 
@@ -61,16 +61,16 @@ class Tile:
             self.surface.inputs[name.replace("_", " ")].default_value = value
 
     def node(self, kind, **values):
-        found = self.tree.nodes.new(kind)
+        node = self.tree.nodes.new(kind)
         for name, value in values.items():
-            setattr(found, name, value)
-        return found
+            setattr(node, name, value)
+        return node
 
     def picture(self, image, coordinates=None, **values):
-        found = self.node("ShaderNodeTexImage", image=image, **values)
+        node = self.node("ShaderNodeTexImage", image=image, **values)
         if coordinates:
-            self.tree.links.new(coordinates, found.inputs["Vector"])
-        return found.outputs
+            self.tree.links.new(coordinates, node.inputs["Vector"])
+        return node.outputs
 
     def color(self, image, coordinates=None, **values):
         self.set("Base Color", self.picture(image, coordinates, **values)["Color"])

@@ -91,7 +91,7 @@ def subdivided(thing):
     """Points and texture coordinates of all corners of what Blender shows."""
     mesh = thing.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
     points = [tuple(mesh.vertices[loop.vertex_index].co) for loop in mesh.loops]
-    return [(*point, *found.uv) for point, found in zip(points, mesh.uv_layers[0].data, strict=True)]
+    return [(*point, *corner.uv) for point, corner in zip(points, mesh.uv_layers[0].data, strict=True)]
 
 
 def dress(mesh):

@@ -48,7 +48,7 @@ def blender(script, *arguments, scene=None):
 def exported(model, usda, script, *files):
     """What an export of a scene tells, which a script for Blender makes with other files."""
     made = blender(script, model, *files)
-    assert all(each.exists() for each in files), made.stdout + made.stderr
+    assert all(path.exists() for path in files), made.stdout + made.stderr
     done = blender(SCRIPT, usda, scene=model)
     assert done.returncode == 0, done.stderr
     return done.stderr
@@ -81,8 +81,8 @@ def distance(ours, theirs):
 
 
 def points_and_texcoords(cage):
-    found = msub.LimitSurface(cage).tessellate(rate=SEGMENTS)
-    return np.concatenate([found.positions, found.texcoords], axis=1)
+    surface = msub.LimitSurface(cage).tessellate(rate=SEGMENTS)
+    return np.concatenate([surface.positions, surface.texcoords], axis=1)
 
 
 def test_surfaces_are_blenders_with_every_rule_of_its_modifier(scene):
@@ -160,27 +160,28 @@ def test_materials_lights_and_camera_are_usds(scene):
     assert stage.GetDefaultPrim().GetName() == "World"
     assert UsdGeom.GetStageUpAxis(stage) == "Z"
     world = stage.GetPrimAtPath("/World")
+
+    def parts(name):
+        mesh = UsdGeom.Imageable(stage.GetPrimAtPath(f"/World/{name}/Cage"))
+        return UsdGeom.Subset.GetGeomSubsets(mesh, "face", "materialBind")
+
     for name in ("ALL_NONE", "W_rfel_1_001"):
-        mesh = stage.GetPrimAtPath(f"/World/{name}/Cage")
-        subsets = UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(mesh), "face", "materialBind")
-        bound = {each.GetIndicesAttr().Get()[-1]: bound_color(each.GetPrim()) for each in subsets}
+        bound = {part.GetIndicesAttr().Get()[-1]: bound_color(part.GetPrim()) for part in parts(name)}
         assert bound == {10: pytest.approx((0.9, 0.6, 0.2)), 11: pytest.approx((0.8, 0.1, 0.05))}
     # Its first slot has a material of the object.
-    mesh = stage.GetPrimAtPath("/World/no_creases/Cage")
-    subsets = UsdGeom.Subset.GetGeomSubsets(UsdGeom.Imageable(mesh), "face", "materialBind")
-    assert [bound_color(each.GetPrim()) for each in subsets] == 2 * [pytest.approx((0.9, 0.6, 0.2))]
+    assert [bound_color(part.GetPrim()) for part in parts("no_creases")] == 2 * [pytest.approx((0.9, 0.6, 0.2))]
     shared = [stage.GetPrimAtPath(f"/World/{name}") for name in ("ALL_NONE", "no_creases", "W_rfel_1_001")]
-    assert [each.IsInstance() for each in shared] == [False, False, True]
+    assert [prim.IsInstance() for prim in shared] == [False, False, True]
     assert bound_color(stage.GetPrimAtPath("/World/Ground/Cage")) == pytest.approx((0.9, 0.6, 0.2))
     camera = UsdGeom.Camera(stage.GetPrimAtPath("/World/Camera")).GetCamera()
     # Blender's default sensor is 36 mm wide, and its picture 1920 x 1080.
     assert camera.GetFieldOfView(camera.FOVHorizontal) == pytest.approx(2 * np.degrees(np.arctan(18 / 80)), rel=1e-6)
     assert camera.aspectRatio == pytest.approx(1920 / 1080)
     assert camera.transform.ExtractTranslation() == (0, -8, 3)
-    lights = {each.GetName(): each for each in world.GetChildren() if each.HasAPI(UsdLux.LightAPI)}
+    lights = {light.GetName(): light for light in world.GetChildren() if light.HasAPI(UsdLux.LightAPI)}
     kinds = {"SUN": "DistantLight", "AREA": "RectLight", "POINT": "SphereLight", "SPOT": "SphereLight"}
-    assert {name: str(each.GetTypeName()) for name, each in lights.items()} == {**kinds, "World": "DomeLight"}
-    intensity = {name: UsdLux.LightAPI(each).GetIntensityAttr().Get() for name, each in lights.items()}
+    assert {name: str(light.GetTypeName()) for name, light in lights.items()} == {**kinds, "World": "DomeLight"}
+    intensity = {name: UsdLux.LightAPI(light).GetIntensityAttr().Get() for name, light in lights.items()}
     assert intensity["SUN"] == 100
     assert intensity["POINT"] == intensity["SPOT"] == pytest.approx(100 / np.pi)
     # Area lights were darker before Blender 4.0.
@@ -217,14 +218,14 @@ def test_pictures_are_those_of_cycles(look):
     """Materials with images, spot, sun, a turned image of the world, depth of field and the shift of the camera."""
     picture, usda, _ = look
     scene = msub.usd_scene(usda, mi)
-    found = np.array(mi.render(mi.load_dict(scene), spp=256))[..., :3]
+    result = np.array(mi.render(mi.load_dict(scene), spp=256))[..., :3]
     expected = np.array(mi.Bitmap(str(picture)).convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32, False))
-    assert found.shape == expected.shape == (72, 96, 3)
-    np.testing.assert_allclose(found[:, WORLD:].mean(axis=1), expected[:, WORLD:].mean(axis=1), atol=WORLD_TOLERANCE)
+    assert result.shape == expected.shape == (72, 96, 3)
+    np.testing.assert_allclose(result[:, WORLD:].mean(axis=1), expected[:, WORLD:].mean(axis=1), atol=WORLD_TOLERANCE)
     for number in range(10):
         row, column = divmod(number, 4)
         middle = np.ix_(*(range(TILE + TILES * place, TILES * (place + 1)) for place in (row, column)))
-        np.testing.assert_allclose(found[middle].mean((0, 1)), expected[middle].mean((0, 1)), atol=TILE_TOLERANCE)
+        np.testing.assert_allclose(result[middle].mean((0, 1)), expected[middle].mean((0, 1)), atol=TILE_TOLERANCE)
 
 
 def test_images_are_beside_the_file_as_they_were(look):
@@ -283,13 +284,13 @@ def test_an_obj_file_has_the_same_cage(scene, tmp_path):
     obj, name = tmp_path / "house.obj", "PRESERVE_CORNERS_PRESERVE_CORNERS"
     done = blender(SCRIPT, obj, "--object", name, scene=blend)
     assert done.returncode == 0, done.stderr
-    found, expected = msub.ControlCage.from_file(obj), cage_of(usda, name)
+    result, expected = msub.ControlCage.from_file(obj), cage_of(usda, name)
     for name in ("positions", "face_vertices", "texcoords.indices", "texcoords.values"):
-        np.testing.assert_array_equal(attrgetter(name)(found), attrgetter(name)(expected))
-    assert found.contents.rules == expected.contents.rules
+        np.testing.assert_array_equal(attrgetter(name)(result), attrgetter(name)(expected))
+    assert result.contents.rules == expected.contents.rules
     # USD has sharpness in single precision.
     for rows in ("creases", "corners"):
-        np.testing.assert_allclose(getattr(found.contents, rows), getattr(expected.contents, rows), rtol=1e-7)
+        np.testing.assert_allclose(getattr(result.contents, rows), getattr(expected.contents, rows), rtol=1e-7)
     # In OBJ files faces of a mirrored object are turned over; readers of USD do it themselves.
     done = blender(SCRIPT, obj, "--object", "Würfel 1.001", scene=blend)
     assert done.returncode == 0, done.stderr

@@ -324,25 +324,17 @@ def test_round_trip_is_exact(any_cage, tmp_path, np_rng, size):
         "flow": Attribute(np_rng.normal(size=(count, 12))),
     }
     arrays = np_rng.normal(size=(count, 3)), any_cage.face_sizes, any_cage.face_vertices
+    owner = np_rng.integers(-1, 3, any_cage.face_count)
+    names = {"": -1, "material_0": 0, "material_12": 1, "material_2": 2}
+    materials = {name: np.flatnonzero(owner == number) for name, number in names.items() if number in owner}
     texcoords = Attribute(np_rng.random((count, 2)))
-    cage = ControlCage.from_arrays(*arrays, texcoords=texcoords, attributes=attributes)
+    cage = ControlCage.from_arrays(*arrays, texcoords=texcoords, attributes=attributes, materials=materials)
     path = tmp_path / "cage.ply"
     cage.save(path)
     again = ControlCage.from_file(path)
     assert same(again.contents, cage.contents)
     assert list(again.attributes) == list(attributes)
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_materials_are_read_back(any_cage, tmp_path, np_rng):
-    """By both readers of binary files: of tables, and of lists of different lengths."""
-    count = any_cage.face_count
-    owner = np_rng.integers(-1, 3, count)
-    names = {"": -1, "material_0": 0, "material_12": 1, "material_2": 2}
-    materials = {name: np.flatnonzero(owner == number) for name, number in names.items() if (owner == number).any()}
-    cage = ControlCage.from_arrays(any_cage.positions, any_cage.face_sizes, any_cage.face_vertices, materials=materials)
-    cage.save(tmp_path / "cage.ply")
-    assert same(ControlCage.from_file(tmp_path / "cage.ply").contents, cage.contents)
 
 
 def test_names_of_materials_have_no_place(tmp_path):

@@ -92,12 +92,6 @@ def test_a_warning_names_attributes_without_a_place(tmp_path, triangles, suffix)
         save(tmp_path / f"a{suffix}", triangles, None, values)
 
 
-@pytest.mark.parametrize("name", ["a.stl", "a.usdz", "a"])
-def test_unknown_formats_name_the_known_ones(tmp_path, triangles, name):
-    with pytest.raises(ValueError, match=r"of triangles; expected one of .obj, .ply, .usd, .usda, .usdc$"):
-        triangles.save(tmp_path / name)
-
-
 def test_command(tmp_path, capsys):
     cube().save(tmp_path / "cube.obj")
     words = ["tessellate", str(tmp_path / "cube.obj"), "--rate", "2", "-o"]

@@ -90,9 +90,3 @@ def test_scenes_that_are_saved_do_not_follow_their_sensor(tmp_path, monkeypatch)
     text = (tmp_path / "a.xml").read_text()
     assert "adaptive" not in text
     assert '<string name="shading" value="exact"/>' in text
-
-
-@pytest.mark.usefixtures("variant_scalar_rgb")
-def test_other_shadings_are_refused():
-    with pytest.raises(ValueError, match='shading "glossy"; expected one of vertex, exact, auto'):
-        msub.studio_scene(CUBE, shading="glossy")

@@ -87,7 +87,7 @@ def test_one_core_reads_and_writes_openexr(folder, options):
     np.testing.assert_allclose(pixels("a.exr")[..., :3], 0.5, rtol=1e-3)
 
 
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@pytest.mark.usefixtures("variant_scalar_rgb")
 def test_a_turntable_comes_round():
     table = Turntable(CageScenes(named_cages.cube(), Look(size=(24, 18), spp=64, rate=4, view="front")), 4)
     np.testing.assert_allclose(table.matrix(5), table.matrix(1), atol=1e-12)
@@ -150,7 +150,6 @@ def test_frames_are_what_each_file_gives_alone(folder, variant, request):
         for name in ("surface.vertex_positions", "surface.vertex_normals"):
             a, b = (np.array(mi.traverse(scene)[name]) for scene in (loaded.scene, apart))
             np.testing.assert_allclose(a, b, atol=2e-6)
-        assert np.isfinite(np.array(mi.render(loaded.scene))).all()
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")

@@ -70,8 +70,7 @@ def test_all_points_are_in_the_picture_and_as_large_as_fits(seed, azimuth, eleva
     np.testing.assert_allclose(again, origin, atol=1e-9 * scale)
 
 
-@pytest.mark.parametrize("up", ["y", "z"])
-@pytest.mark.parametrize("view", [*VIEWS, (200, 40), (-60, -30)])
+@pytest.mark.parametrize(("view", "up"), [*zip([*VIEWS, (200, 40), (-60, -30)], "yzyzyzy", strict=True)])
 @llvm
 def test_mitsubas_sensor_has_every_limit_point_on_its_film(up, view):
     surface = msub.LimitSurface(msub.ControlCage.from_file(CAGES / "human.obj"))
@@ -88,8 +87,8 @@ def test_mitsubas_sensor_has_every_limit_point_on_its_film(up, view):
     assert reach[0] > 1 - 2.2 * MARGIN
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1, 1e4])
-@llvm
+@pytest.mark.parametrize("scale", [1e-3, 1e4])
+@scalar
 def test_pictures_of_any_size_of_model_are_the_same_and_not_clipped(scale):
     cage = named_cages.extraordinary(5, closed=False)
     pictures = []
@@ -121,7 +120,7 @@ def test_a_model_of_a_size_that_mitsuba_cannot_render_is_told_with_the_name_of_i
             studio_scene(model, **SMALL)
 
 
-@llvm
+@scalar
 def test_y_up_and_z_up_are_the_same_picture():
     cage = msub.ControlCage.from_file(CAGES / "rook.obj")
     turned = cage.with_positions(cage.positions @ np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]]))
@@ -131,7 +130,7 @@ def test_y_up_and_z_up_are_the_same_picture():
     assert np.abs(a - b).mean() < 0.01
 
 
-@llvm
+@scalar
 @pytest.mark.parametrize("view", ["three-quarter", (20, -20)])
 def test_a_saved_scene_renders_to_the_same_picture(tmp_path, view):
     look = {"up": "z", "view": view, "checker": True, "cage": True}
@@ -264,6 +263,7 @@ def test_the_up_axis_is_the_one_of_the_file(tmp_path):
         # It differs from what was expected.
         ({"view": (0, 90.00000001)}, "elevation 90.00000001; expected -90 to 90"),
         ({"up": "x"}, 'up axis "x"; expected y or z'),
+        ({"shading": "glossy"}, 'shading "glossy"; expected one of vertex, exact, auto'),
         ({"size": (0, 4)}, "expected width and height"),
         ({"spp": 0}, "expected 1 or more samples per pixel"),
         ({"checker": True}, "has no texture coordinates"),

@@ -190,6 +190,10 @@ def rates_of(shape):
     return {shape: np.where(np.arange(COUNT) < 10, 3, 1)}
 
 
+def joined(contents):
+    return with_copies(contents, {}, "exact", StageWarnings())[0].shapes
+
+
 def test_copies_of_one_rate_are_one_shape():
     shape, alone = ShapeContents("/cube", cube(), np.eye(4)), ShapeContents("/alone", cube(), np.eye(4))
     contents, rates = with_copies(scene([alone], [shape]), rates_of(shape), "exact", StageWarnings())
@@ -198,23 +202,9 @@ def test_copies_of_one_rate_are_one_shape():
     assert (rates[many], rates[few], len(few.cage.face_sizes)) == (1, 3, 6 * 10)
     expected = [POINTS * [1, 2, 1] + [number, 0, 0] for number in range(10)]
     np.testing.assert_allclose(few.cage.positions, np.concatenate(expected))
-
-
-def joined(contents):
-    return with_copies(contents, {}, "exact", StageWarnings())[0].shapes
-
-
-def test_copies_of_a_part_show_its_faces_only():
-    part = ShapeContents("/cube", cube(), np.eye(4), shown_faces=np.array([1, 4]))
-    expected = np.add.outer(6 * np.arange(COUNT), [1, 4]).ravel()
-    np.testing.assert_array_equal(joined(scene(group=[part]))[0].shown_faces, expected)
-
-
-@pytest.mark.parametrize("faces", [FACES[:1], FACES[:2]])
-def test_copies_of_few_faces_are_one_shape(faces):
-    sheet = CageContents(POINTS, np.full(len(faces), 4), np.concatenate(faces), scheme="catmull_clark")
-    shapes = joined(scene(group=[ShapeContents("/sheet", sheet, np.eye(4))]))
-    assert [len(shape.cage.face_sizes) for shape in shapes] == [len(faces) * COUNT]
+    # Those of a part show its faces only.
+    (part,) = joined(scene(group=[replace(shape, shown_faces=np.array([1, 4]))]))
+    np.testing.assert_array_equal(part.shown_faces, np.add.outer(6 * np.arange(COUNT), [1, 4]).ravel())
 
 
 @pytest.mark.parametrize("shading", ["vertex", "exact"])
@@ -227,6 +217,8 @@ def test_the_highest_rate_gives_way_to_memory(monkeypatch, shading):
         monkeypatch.setattr(copies, "MOST_BYTES", allowed)
         _, rates = with_copies(scene(group=[shape]), rates_of(shape), shading, StageWarnings())
         assert [*rates.values()] == expected
+    # Rates that are chosen do not give way.
+    assert with_copies(scene(group=[shape]), rates_of(shape), shading, StageWarnings(), lowest=3)[1] == {}
 
 
 def test_what_is_too_few_or_too_much_stays_instances_and_much_is_told_with_numbers(monkeypatch):
@@ -237,14 +229,6 @@ def test_what_is_too_few_or_too_much_stays_instances_and_much_is_told_with_numbe
     assert with_copies(contents, rates_of(shape), "exact", notes) == (contents, {})
     with pytest.warns(UserWarning, match=rf"copies with {6 * COUNT:,} faces .* GB, and stay {COUNT} instances"):
         notes.warn("stage")
-
-
-def test_rates_that_are_chosen_do_not_give_way(monkeypatch):
-    monkeypatch.setattr(copies, "MOST_BYTES", copies.TRIANGLE_BYTES * 12 * COUNT * 3)
-    shape = ShapeContents("/cube", cube(), np.eye(4))
-    rates = {shape: np.full(COUNT, 4)}
-    assert with_copies(scene(group=[shape]), rates, "vertex", StageWarnings(), lowest=4)[1] == {}
-    assert [*with_copies(scene(group=[shape]), rates, "vertex", StageWarnings())[1].values()] == [1]
 
 
 def test_copies_that_are_no_instances_are_one_shape_too():
@@ -283,9 +267,7 @@ def test_large_copies_are_shapes_of_their_own_that_share_a_cage(monkeypatch):
     assert with_copies(separate, {}, "exact", StageWarnings()) == (separate, {})
     monkeypatch.setattr(copies, "MOST_BYTES", copies.TRIANGLE_BYTES * 2 * LARGE * COUNT - 1)
     assert with_large_copies(contents) is contents
-
-
-def test_small_or_few_copies_are_no_shapes_of_their_own():
-    large, small = (ShapeContents("/strip", strip(count), np.eye(4)) for count in (LARGE, LARGE - 1))
-    for contents in (scene(group=[small]), scene(group=[large], count=LEAST_INSTANCES - 1)):
+    # Nor are small ones, or few.
+    small = ShapeContents("/strip", strip(LARGE - 1), np.eye(4))
+    for contents in (scene(group=[small]), scene(group=[shape], count=LEAST_INSTANCES - 1)):
         assert [*with_large_copies(contents).instances] == contents.instances
