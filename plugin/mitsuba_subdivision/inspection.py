@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,64 +27,11 @@ HIGH_VALENCE = 12
 VERTEX_BYTES, TEXCOORD_BYTES, TRIANGLE_BYTES = 24, 8, 16
 
 
-@dataclass(frozen=True)
-class Inspection:
-    """Statistics of a cage and its limit surface."""
-
-    name: str  # How messages call the cage
-    scheme: str
-    vertex_count: int
-    edge_count: int
-    face_count: int
-    component_count: int
-    # Least and greatest coordinates of the control points that faces have
-    bounding_box: tuple[tuple[float, ...], tuple[float, ...]]
-    # How many faces have so many corners, and how many inner vertices so many faces
-    face_sizes: dict[int, int]
-    valences: dict[int, int]
-    boundary_edge_count: int
-    boundary_loop_count: int
-    boundary: str  # The boundary rule
-    rules: dict[str, str]  # The other rules where they are not the default
-    # Numbers of infinitely sharp and semi-sharp edges and vertices, darts and holes, and of the edges and vertices
-    # that are sharp because the cage is no manifold there
-    sharp: dict[str, int]
-    attributes: dict[str, str]  # Interpolation of each attribute, and how many edges of face-varying ones are seams
-    patch_count: int
-    class_count: int
-    # The tessellation at a rate: segments per edge, triangles, and memory of the mesh that Mitsuba gets
-    rate: int
-    triangle_count: int
-    mesh_bytes: int
-    warnings: tuple[str, ...]  # What will look odd
-
-    def __str__(self) -> str:
-        counts = f"{self.vertex_count:,} vertices, {self.edge_count:,} edges, {self.face_count:,} faces"
-        loops = f"{self.boundary_loop_count:,} loop{'s' * (self.boundary_loop_count != 1)}, rule {self.boundary}"
-        boundary = f"{self.boundary_edge_count:,} edges in {loops}"
-        rows = [
-            ("cage", f"{self.name}: {counts}"),
-            ("box", " to ".join("({:g}, {:g}, {:g})".format(*corner) for corner in self.bounding_box)),
-            ("faces", _listed(self.face_sizes, "{:,} of {} corners")),
-            ("inner vertices", _listed(self.valences, "{:,} of valence {}")),
-            ("boundary", boundary if self.boundary_edge_count else "none, the cage is closed"),
-            ("sharp", ", ".join(f"{count:,} {what}" for what, count in self.sharp.items() if count) or "nothing"),
-            ("rules", ", ".join(f"{name} {rule}" for name, rule in self.rules.items()) or "the default"),
-            ("attributes", ", ".join(f"{name}: {what}" for name, what in self.attributes.items()) or "none"),
-            ("patches", f"{self.patch_count:,} of {self.class_count:,} classes under {self.scheme}"),
-            ("at rate", f"{self.rate}: {self.triangle_count:,} triangles, {self.mesh_bytes / 1e6:,.1f} MB as a mesh"),
-            *(("warning", warning) for warning in self.warnings),
-        ]
-        if self.component_count > 1:
-            rows.insert(1, ("pieces", f"{self.component_count:,} that share no vertex"))
-        return "\n".join(f"{title + ':':<16}{text}" for title, text in rows)
-
-
 def inspect(
     surface: LimitSurface,
     rate: int = 8,  # Segments per edge of the tessellation whose size is predicted, at least 1
-) -> Inspection:
-    """Inspect a cage under a scheme. Raises ValueError if the rate is below 1."""
+) -> dict[str, Any]:
+    """Inspect a cage under a scheme: plain values by name. Raises ValueError if the rate is below 1."""
     if rate < 1:
         raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
     cage = surface.cage
@@ -92,29 +40,57 @@ def inspect(
     rules = {name: getattr(cage, name) for name in RULES}
     triangle_count, vertex_count = _tessellation_size(surface, rate)
     vertex_bytes = VERTEX_BYTES + (TEXCOORD_BYTES if cage.texcoords else 0)
-    return Inspection(
-        name=cage.source.name,
-        scheme=surface.scheme.name,
-        vertex_count=cage.vertex_count,
-        edge_count=len(cage.edges),
-        face_count=cage.face_count,
-        component_count=_piece_count(t, np.arange(t.half_edge_count)),
-        bounding_box=(tuple(used.min(axis=0).tolist()), tuple(used.max(axis=0).tolist())),
-        face_sizes=_histogram(cage.face_sizes),
-        valences=_histogram(t.vertex_face_count[_inner_vertices(cage)]),
-        boundary_edge_count=int(cage.is_boundary.sum()),
-        boundary_loop_count=_piece_count(t, np.flatnonzero(cage.is_boundary)),
-        boundary=cage.boundary,
-        rules={name: rule for name, rule in rules.items() if name != "boundary" and rule != RULES[name][0]},
-        sharp=_sharp_features(cage),
-        attributes=_attributes(cage),
-        patch_count=surface.patches.patch_count,
-        class_count=len(surface.patches.classes),
-        rate=rate,
-        triangle_count=triangle_count,
-        mesh_bytes=vertex_count * vertex_bytes + triangle_count * TRIANGLE_BYTES,
-        warnings=tuple(_warnings(surface)),
-    )
+    return {
+        "name": cage.source.name,
+        "scheme": surface.scheme.name,
+        "vertex_count": cage.vertex_count,
+        "edge_count": len(cage.edges),
+        "face_count": cage.face_count,
+        # Connected parts that share no vertex.
+        "component_count": _piece_count(t, np.arange(t.half_edge_count)),
+        # Least and greatest coordinates of the control points that faces have.
+        "bounding_box": (used.min(axis=0).tolist(), used.max(axis=0).tolist()),
+        # How many faces have so many corners, and how many inner vertices so many faces.
+        "face_sizes": _histogram(cage.face_sizes),
+        "valences": _histogram(t.vertex_face_count[_inner_vertices(cage)]),
+        "boundary_edge_count": int(cage.is_boundary.sum()),
+        "boundary_loop_count": _piece_count(t, np.flatnonzero(cage.is_boundary)),
+        "boundary": cage.boundary,
+        # The other rules where they are not the default.
+        "rules": {name: rule for name, rule in rules.items() if name != "boundary" and rule != RULES[name][0]},
+        "sharp": _sharp_features(cage),
+        "attributes": _attributes(cage),
+        "patch_count": surface.patches.patch_count,
+        "class_count": len(surface.patches.classes),
+        # Of the tessellation: segments per edge, triangles, and memory of the mesh that Mitsuba gets.
+        "rate": rate,
+        "triangle_count": triangle_count,
+        "mesh_bytes": vertex_count * vertex_bytes + triangle_count * TRIANGLE_BYTES,
+        # What will look odd.
+        "warnings": list(_warnings(surface)),
+    }
+
+
+def in_words(inspected: dict[str, Any]) -> str:
+    """What `inspect` returns, as lines of text."""
+    of = SimpleNamespace(**inspected)
+    loops = f"{of.boundary_loop_count:,} loop{'s' * (of.boundary_loop_count != 1)}, rule {of.boundary}"
+    boundary = f"{of.boundary_edge_count:,} edges in {loops}"
+    rows = [
+        ("cage", f"{of.name}: {of.vertex_count:,} vertices, {of.edge_count:,} edges, {of.face_count:,} faces"),
+        ("pieces", f"{of.component_count:,} that share no vertex" if of.component_count > 1 else ""),
+        ("box", " to ".join("({:g}, {:g}, {:g})".format(*corner) for corner in of.bounding_box)),
+        ("faces", _listed(of.face_sizes, "{:,} of {} corners")),
+        ("inner vertices", _listed(of.valences, "{:,} of valence {}")),
+        ("boundary", boundary if of.boundary_edge_count else "none, the cage is closed"),
+        ("sharp", ", ".join(f"{count:,} {what}" for what, count in of.sharp.items() if count) or "nothing"),
+        ("rules", ", ".join(f"{name} {rule}" for name, rule in of.rules.items()) or "the default"),
+        ("attributes", ", ".join(f"{name}: {what}" for name, what in of.attributes.items()) or "none"),
+        ("patches", f"{of.patch_count:,} of {of.class_count:,} classes under {of.scheme}"),
+        ("at rate", f"{of.rate}: {of.triangle_count:,} triangles, {of.mesh_bytes / 1e6:,.1f} MB as a mesh"),
+        *(("warning", warning) for warning in of.warnings),
+    ]
+    return "\n".join(f"{title + ':':<16}{text}" for title, text in rows if text)
 
 
 def _inner_vertices(cage: ControlCage) -> NDArray[np.bool_]:

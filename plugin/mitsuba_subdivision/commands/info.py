@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 from pathlib import Path
 
@@ -56,12 +55,12 @@ def _surface(options: argparse.Namespace) -> LimitSurface:
 
 
 def _info(options: argparse.Namespace) -> None:
-    from ..inspection import inspect
+    from ..inspection import in_words, inspect
 
-    inspection = inspect(_surface(options), options.rate)
+    inspected = inspect(_surface(options), options.rate)
     # Without the quotes that names of files have in messages.
-    plain = dataclasses.replace(inspection, name=inspection.name.replace('"', ""))
-    print_result(json.dumps(dataclasses.asdict(plain), indent=1) if options.json else inspection)
+    plain = {**inspected, "name": inspected["name"].replace('"', "")}
+    print_result(json.dumps(plain, indent=1) if options.json else in_words(inspected))
 
 
 def _tessellate(options: argparse.Namespace) -> None:
