@@ -111,7 +111,7 @@ def test_signs_of_eigenvectors_do_not_matter(scheme, cage, np_rng, monkeypatch):
     computed = irregular_patch.eigenbasis
 
     def clear_caches():
-        for function in (patch_tree.irregular_patch, patch_tree.whole_piece, patch_tree.patch_tree):
+        for function in (patch_tree.irregular_patch, patch_tree.patch_tree):
             function.cache_clear()
 
     def turned(*given):

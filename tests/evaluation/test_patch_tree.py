@@ -8,7 +8,7 @@ from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.irregular_patch import level_domains, level_rows, rest_rows
-from mitsuba_subdivision.evaluation.patch_tree import PartKind, patch_tree, patch_trees, whole_piece
+from mitsuba_subdivision.evaluation.patch_tree import PartKind, patch_tree, patch_trees
 from mitsuba_subdivision.evaluation.refined_rings import refined_children
 from mitsuba_subdivision.patches import PatchTable
 from mitsuba_subdivision.schemes import CatmullClark, SchemeError
@@ -173,11 +173,7 @@ def test_children_that_are_no_copies_of_the_domain_are_an_error():
     ids=["divided", "sampled"],
 )
 def test_patches_that_no_refinement_isolates_are_an_error(use, monkeypatch):
-    def only_regular(scheme, signature):
-        piece = whole_piece(scheme, signature)
-        return None if piece is None or piece.patch is not None else piece
-
-    monkeypatch.setattr("mitsuba_subdivision.evaluation.patch_tree.whole_piece", only_regular)
+    monkeypatch.setattr("mitsuba_subdivision.evaluation.patch_tree.irregular_patch", lambda *_: None)
     scheme, (signature, *_) = classes(surface_named("cube"))
     with pytest.raises(SchemeError, match="expected a scheme that isolates extraordinary points"):
         use(scheme, signature)

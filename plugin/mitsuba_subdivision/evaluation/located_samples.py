@@ -137,7 +137,7 @@ class LocatedSamples:
                 speed[in_child] *= parent.tree.domains[number].matrix[0, 0]
             trees, samples = [*in_children], [np.concatenate(in_parents) for _, in_parents in in_children.values()]
         else:
-            raise not_isolated(scheme, trees[0].signature, MOST_DEPTH + 1)
+            raise not_isolated(scheme, trees[0].signature)
         uv = _turned(scheme, uv, leaf_turn)
         self.leaves, begin = list[Leaves](), 0
         for patch, rows in in_leaves.items():

@@ -30,16 +30,12 @@ from ..schemes.scheme import Scheme, SchemeError
 from .irregular_patch import IrregularPatch
 from .refined_rings import refined_children
 
-# Maximum number of refinements until an element without semi-sharp features consists of pieces. A scheme that needs
-# more is refused: its rules keep making new extraordinary points. The schemes of this package need one or two.
-MAX_REFINEMENTS = 6
-# Number of refinements after which nothing is semi-sharp: each one reduces the sharpness, which is below `INFINITE`, by
-# one.
-MOST_SEMI_SHARP_REFINEMENTS = int(INFINITE)
 # Number of control points of the one-rings that are refined together, which bounds memory to tens of megabytes.
 JOINED_CONTROLS = 1 << 14
-# Maximum depth of a patch tree.
-MOST_DEPTH = MOST_SEMI_SHARP_REFINEMENTS + MAX_REFINEMENTS + 1
+# Maximum depth of a patch tree. Each refinement reduces the sharpness of semi-sharp features, which is below `INFINITE`,
+# by one. Without them, the schemes of this package need one or two refinements until all elements are pieces. A scheme
+# that needs more than six is refused: its rules keep making new extraordinary points.
+MOST_DEPTH = int(INFINITE) + 7
 
 
 class PartKind(IntEnum):
@@ -67,8 +63,23 @@ class PatchTree:
 
     @cached_property
     def piece(self) -> Piece | None:
-        """The whole element as one piece, or None if it must be divided."""
-        return whole_piece(self.scheme, self.signature)
+        """The whole element as one piece: a regular patch, or self-similar at one of its corners. None for others."""
+        scheme, signature = self.scheme, self.signature
+        if signature.is_semi_sharp:
+            # Not self-similar: each refinement reduces the sharpness.
+            return None
+        lattice = lattice_stencils(scheme, signature)
+        if lattice is not None:
+            return Piece(IDENTITY, lattice, None)
+        corner_count = len(signature.fans) if signature.kind == "face" else signature.fans[0].face_count
+        # The parameters of an element that does not fit the domain begin at its first corner only.
+        for corner in range(corner_count if corner_count == scheme.domain.corner_count else 1):
+            patch = irregular_patch(scheme, signature.rotated(corner))
+            if patch is not None:
+                order = rotation_order(signature, corner)
+                domain = scheme.domain.rotation(corner).inverse()
+                return Piece(domain, np.eye(len(order))[order[patch.slots]], patch)
+        return None
 
     @cached_property
     def kind(self) -> PartKind:
@@ -212,15 +223,15 @@ def patch_trees(scheme: Scheme, signatures: Iterable[Signature]) -> list[PatchTr
         undivided = list(dict.fromkeys(child for element in undivided for child, _ in element.children))
         if not undivided:
             return elements
-    raise not_isolated(scheme, undivided[0].signature, MOST_DEPTH + 1)
+    raise not_isolated(scheme, undivided[0].signature)
 
 
-def not_isolated(scheme: Scheme, rest: Signature, refinements: int) -> SchemeError:
-    """Return the error for a signature that is no piece after a number of refinements."""
+def not_isolated(scheme: Scheme, rest: Signature) -> SchemeError:
+    """Return the error for a signature that is no piece after `MOST_DEPTH` refinements and one."""
     if rest.is_semi_sharp:
         return SchemeError(
-            f"{scheme.name}: {refinements} refinements leave something of a {rest.kind} semi-sharp; expected each to "
-            "take one from the sharpness"
+            f"{scheme.name}: {MOST_DEPTH + 1} refinements leave something of a {rest.kind} semi-sharp; expected each "
+            "to take one from the sharpness"
         )
     return SchemeError(
         f"{scheme.name}: refinement leaves a {rest.kind} with fans {rest.fans} neither regular nor self-similar; "
@@ -264,24 +275,6 @@ class Piece:
         return Piece(self.domain @ domain, self.stencils @ stencils, self.patch)
 
 
-@lru_cache(maxsize=4096)
-def whole_piece(scheme: Scheme, signature: Signature) -> Piece | None:
-    """Return the element as one piece if it is a regular patch, or self-similar at one of its corners; else None."""
-    if signature.is_semi_sharp:
-        # Not self-similar: each refinement reduces the sharpness.
-        return None
-    lattice = lattice_stencils(scheme, signature)
-    if lattice is not None:
-        return Piece(IDENTITY, lattice, None)
-    for corner in range(rotation_count(scheme, signature)):
-        patch = irregular_patch(scheme, signature.rotated(corner))
-        if patch is not None:
-            order = rotation_order(signature, corner)
-            domain = scheme.domain.rotation(corner).inverse()
-            return Piece(domain, np.eye(len(order))[order[patch.slots]], patch)
-    return None
-
-
 def regular_signature(scheme: Scheme) -> Signature:
     """Return the signature of an element surrounded by regular faces and vertices."""
     corners = 1 if scheme.element == "vertex" else scheme.regular_face_size
@@ -304,12 +297,6 @@ def isolated_signature(
 def _regular_fan(scheme: Scheme) -> Fan:
     """Return the faces around a regular vertex."""
     return Fan((scheme.regular_face_size,) * scheme.regular_valence)
-
-
-def rotation_count(scheme: Scheme, signature: Signature) -> int:
-    """Return the number of corners that can be the first: all, or one if the element does not fit the domain."""
-    corners = len(signature.fans) if signature.kind == "face" else signature.fans[0].face_count
-    return corners if corners == scheme.domain.corner_count else 1
 
 
 @lru_cache(maxsize=4096)
