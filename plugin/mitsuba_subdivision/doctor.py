@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.metadata
 import json
 import platform
@@ -11,10 +10,9 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass, field
 from typing import Any
 
-from .llvm import LlvmChoice, lowest_version, select_llvm, version_without_package
+from .llvm import lowest_version, select_llvm, version_without_package
 
 # Variants that are tried, and whether a machine is expected to have what they need.
 VARIANTS = {"scalar_rgb": True, "llvm_ad_rgb": True, "cuda_ad_rgb": False}
@@ -33,111 +31,97 @@ TOLERANCE = 1e-5
 _CHILD = "import sys; from mitsuba_subdivision.doctor import _print_report; _print_report(sys.argv[1])"
 
 
-@dataclass(frozen=True)
-class VariantReport:
-    """Result of a test of one variant of Mitsuba."""
-
-    # Whether it renders a surface at the right place. None if the machine lacks what it needs, and need not have it.
-    works: bool | None
-    problem: str | None = None  # Why it does not work
-    exact_shading: bool = False  # Whether exact shading puts a hit on the surface
-    exact_problem: str | None = None  # Why exact shading does not work
-    llvm: int | None = None  # Major version of the LLVM library that Dr.Jit has loaded
-    seconds: float = 0.0  # From the start of the process to its end
-
-
-@dataclass(frozen=True)
-class Diagnosis:
-    """Facts about a machine for a bug report."""
-
-    # Of this package, Python and the packages that it needs; None for one that is missing
-    versions: dict[str, str | None]
-    machine: str  # Operating system and processor
-    llvm: LlvmChoice  # Which LLVM library this package has chosen, and why
-    # Major version of the library that programs get which import Mitsuba first. None if there is none.
-    late_llvm: int | None
-    variants: dict[str, VariantReport]
-    # Versions of the packages of each extra; None for missing ones
-    extras: dict[str, dict[str, str | None]] = field(default_factory=dict)
-
-    @property
-    def healthy(self) -> bool:
-        """Whether everything works that the machine should support."""
-        return None not in self.versions.values() and all(
-            report.works is not False for report in self.variants.values()
-        )
-
-    def as_json(self) -> str:
-        """All of it, as JSON."""
-        return json.dumps({**dataclasses.asdict(self), "llvm": self.llvm._asdict(), "healthy": self.healthy}, indent=1)
-
-    def __str__(self) -> str:
-        llvm = self.llvm
-        lines = [("machine", self.machine)]
-        lines += [(name, version or "MISSING") for name, version in self.versions.items()]
-        version = f", version {llvm.version}" if llvm.version else ""
-        lines.append(("LLVM", f"{llvm.path or 'none chosen'}{version} ({llvm.reason})"))
-        late = f"version {self.late_llvm}" if self.late_llvm else "none"
-        if self.late_llvm and self.late_llvm < lowest_version():
-            late += ", whose kernels end the process: import mitsuba_subdivision before mitsuba and drjit"
-        lines.append(("LLVM, Mitsuba first", late))
-        for name, report in self.variants.items():
-            if report.works:
-                exact = "works" if report.exact_shading else f"does not work: {report.exact_problem}"
-                loaded = f", LLVM {report.llvm}" if report.llvm and name.startswith("llvm") else ""
-                lines.append((name, f"works ({report.seconds:.1f} s{loaded}); exact shading {exact}"))
-            else:
-                lines.append((name, f"{'not available' if report.works is None else 'FAILS'}: {report.problem}"))
-        for name, packages in self.extras.items():
-            listed = ", ".join(f"{package} {version or 'is not installed'}" for package, version in packages.items())
-            lines.append((f"extra {name}", listed))
-        all_works = "everything that this machine should support works"
-        verdict = all_works if self.healthy else "there are PROBLEMS, listed above"
-        width = max(len(name) for name, _ in lines)
-        return "\n".join([*(f"{name:{width}}  {text}" for name, text in lines), verdict])
-
-
 def diagnose(
     # Names of variants, and whether one that the machine has no device for is a problem. By default `VARIANTS`.
     variants: dict[str, bool] | None = None,
-) -> Diagnosis:
-    """Collect versions, and render a small surface in each variant, each in its own process."""
+) -> dict[str, Any]:
+    """Collect versions, and render a small surface in each variant, each in its own process: facts for a bug report.
+
+    Versions of packages that are missing are None.
+    """
     from . import __version__
 
     versions = {DISTRIBUTION: __version__, "Python": platform.python_version(), **{n: _version(n) for n in PACKAGES}}
     tried = {name: try_variant(name, needed) for name, needed in (VARIANTS if variants is None else variants).items()}
-    return Diagnosis(versions, platform.platform(), select_llvm(), version_without_package(), tried, _extras())
+    return {
+        "versions": versions,
+        "machine": platform.platform(),
+        # Which LLVM library this package has chosen, and why.
+        "llvm": select_llvm()._asdict(),
+        # Major version of the library that programs get which import Mitsuba first; None if there is none.
+        "late_llvm": version_without_package(),
+        "variants": tried,
+        "extras": _extras(),
+        # Whether everything works that the machine should support.
+        "healthy": None not in versions.values() and all(report["works"] is not False for report in tried.values()),
+    }
+
+
+def in_words(diagnosis: dict[str, Any]) -> str:
+    """What `diagnose` returns, as lines of text."""
+    llvm, late = diagnosis["llvm"], diagnosis["late_llvm"]
+    lines = [("machine", diagnosis["machine"])]
+    lines += [(name, version or "MISSING") for name, version in diagnosis["versions"].items()]
+    version = f", version {llvm['version']}" if llvm["version"] else ""
+    lines.append(("LLVM", f"{llvm['path'] or 'none chosen'}{version} ({llvm['reason']})"))
+    crashes = ", whose kernels end the process: import mitsuba_subdivision before mitsuba and drjit"
+    too_old = crashes if late and late < lowest_version() else ""
+    lines.append(("LLVM, Mitsuba first", f"version {late}{too_old}" if late else "none"))
+    for name, report in diagnosis["variants"].items():
+        if report["works"]:
+            exact = "works" if report["exact_shading"] else f"does not work: {report['exact_problem']}"
+            loaded = f", LLVM {report['llvm']}" if report["llvm"] and name.startswith("llvm") else ""
+            lines.append((name, f"works ({report['seconds']:.1f} s{loaded}); exact shading {exact}"))
+        else:
+            lines.append((name, f"{'not available' if report['works'] is None else 'FAILS'}: {report['problem']}"))
+    for name, packages in diagnosis["extras"].items():
+        listed = ", ".join(f"{package} {version or 'is not installed'}" for package, version in packages.items())
+        lines.append((f"extra {name}", listed))
+    all_works = "everything that this machine should support works"
+    verdict = all_works if diagnosis["healthy"] else "there are PROBLEMS, listed above"
+    width = max(len(name) for name, _ in lines)
+    return "\n".join([*(f"{name:{width}}  {text}" for name, text in lines), verdict])
 
 
 def try_variant(
     variant: str,
     needed: bool = True,  # Whether it is a problem if the machine has no device for it
     seconds: float = SECONDS,  # After which the process is ended
-) -> VariantReport:
-    """Render a small surface in a separate process, so that a crash is reported."""
+) -> dict[str, Any]:
+    """Render a small surface in a separate process, so that a crash is reported.
+
+    Returns "works", whether a surface is rendered at the right place, None if the machine lacks what it needs and need
+    not have it; "problem", why not; "exact_shading" and "exact_problem" likewise; "llvm", the major version of the
+    library that Dr.Jit has loaded; and "seconds", from the start of the process to its end.
+    """
     start = time.monotonic()
+    report = _in_process(variant, seconds)
+    if report["works"] is None and needed:
+        report["works"] = False
+    nothing = {"problem": None, "exact_shading": False, "exact_problem": None, "llvm": None}
+    return {**nothing, **report, "seconds": round(time.monotonic() - start, 2)}
+
+
+def _in_process(variant: str, seconds: float) -> dict[str, Any]:
+    """What another process reports of a variant, or how it ended."""
     command = [sys.executable, "-c", _CHILD, variant]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=seconds, check=False)
     except subprocess.TimeoutExpired:
-        return VariantReport(False, f"did not end within {seconds:g} s", seconds=time.monotonic() - start)
-    took = round(time.monotonic() - start, 2)
+        return {"works": False, "problem": f"did not end within {seconds:g} s"}
     if done.returncode < 0:
         names = {number.value: number.name for number in signal.Signals}
         name = names.get(-done.returncode, f"signal {-done.returncode}")
-        return VariantReport(False, f"the process crashed ({name})", seconds=took)
+        return {"works": False, "problem": f"the process crashed ({name})"}
     try:
-        report = json.loads(done.stdout.splitlines()[-1])
+        return dict(json.loads(done.stdout.splitlines()[-1]))
     except (IndexError, ValueError):
         last = (done.stderr.strip().splitlines() or ["no output"])[-1]
-        return VariantReport(False, f"the process ended with {done.returncode}: {last}", seconds=took)
-    if report["works"] is None and needed:
-        report["works"] = False
-    return VariantReport(**report, seconds=took)
+        return {"works": False, "problem": f"the process ended with {done.returncode}: {last}"}
 
 
 def _print_report(variant: str) -> None:
-    """Try a variant in this process, and print a `VariantReport` as JSON."""
+    """Try a variant in this process, and print the report as JSON."""
     print(json.dumps(_report(variant)), flush=True)  # noqa: T201 - for the process that has started this one
 
 
@@ -163,11 +147,14 @@ def _report(variant: str) -> dict[str, Any]:
 
 
 def _problem(**parameters: Any) -> str | None:
-    """What is wrong with a render, in one line; None if nothing is."""
+    """What is wrong with a render of the limit surface of a cube, in one line; None if nothing is."""
     try:
-        return _wrong_height(_rendered_height(**parameters))
+        height = _rendered_height(**parameters)
     except Exception as error:
         return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[-1]}"
+    if abs(height - CUBE_HEIGHT) <= TOLERANCE:
+        return None
+    return f"the limit surface of a cube was rendered at the height {height:.6f}; expected {CUBE_HEIGHT:.6f}"
 
 
 def _rendered_height(**parameters: Any) -> float:
@@ -186,12 +173,6 @@ def _rendered_height(**parameters: Any) -> float:
         "surface": {"type": "subdivision", **cube().as_properties(mi), **parameters},
     }
     return float(mi.TensorXf(mi.render(mi.load_dict(scene), spp=1)).array[2])
-
-
-def _wrong_height(height: float) -> str | None:
-    if abs(height - CUBE_HEIGHT) <= TOLERANCE:
-        return None
-    return f"the limit surface of a cube was rendered at the height {height:.6f}; expected {CUBE_HEIGHT:.6f}"
 
 
 def _version(package: str) -> str | None:

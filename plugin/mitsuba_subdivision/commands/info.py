@@ -75,8 +75,8 @@ def _tessellate(options: argparse.Namespace) -> None:
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    from ..doctor import diagnose
+    from ..doctor import diagnose, in_words
 
     diagnosis = diagnose()
-    print_result(diagnosis.as_json() if options.json else diagnosis)
-    return 0 if diagnosis.healthy else 1
+    print_result(json.dumps(diagnosis, indent=1) if options.json else in_words(diagnosis))
+    return 0 if diagnosis["healthy"] else 1
