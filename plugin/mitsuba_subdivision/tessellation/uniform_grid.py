@@ -61,8 +61,6 @@ class UniformGrid:
         self._half, self._is_odd = rate // 2, rate % 2 == 1
         # Steps from a corner of a polygon to samples inside its grid: for an even rate, the last one is on a spoke.
         self._inside = np.arange(1, self._half + self._is_odd)
-        # Triangles of one corner of a polygon.
-        self._corner_triangles = 2 * self._half**2 + self._is_odd * (2 * self._half + 1)
 
     # Numbers of vertices
 
@@ -74,12 +72,10 @@ class UniformGrid:
     @cached_property
     def _inner_counts(self) -> IntArray:
         """``(n_f,)`` vertices strictly inside each element."""
-        sizes, of_whole = self.topology.face_sizes, (self.rate - 1) * (self.rate - 1)
-        if self.domain.corner_count == 3:
-            of_whole = (self.rate - 1) * (self.rate - 2) // 2
+        sizes, n = self.topology.face_sizes, len(self._inside)
+        of_whole = (self.rate - 1) * (self.rate - 2) // 2 if self.domain.corner_count == 3 else (self.rate - 1) ** 2
         # Polygons have a centre and, for an even rate, spokes.
-        of_corner = len(self._inside) * (len(self._inside) + (not self._is_odd))
-        return np.where(self._is_whole, of_whole, sizes * of_corner + (sizes > 0))
+        return np.where(self._is_whole, of_whole, sizes * n * (n + (not self._is_odd)) + (sizes > 0))
 
     @cached_property
     def corner_vertex(self) -> NDArray[np.uint32]:
@@ -112,14 +108,10 @@ class UniformGrid:
 
         Steps 0 and ``rate`` are the ends of the edge.
         """
-        is_forward = self._are_lowest(corners)
-        # Unsigned sums wrap around 2^32, so that 2^32 - 1 acts as -1.
-        start = self.edge_start(corners).astype(np.uint32)
-        start += np.where(is_forward, np.uint32(2**32 - 1), np.uint32(self.rate - 1))
-        step = np.where(is_forward, np.uint32(1), np.uint32(2**32 - 1))
         # Corners are the last axis, as there are more corners than steps, and NumPy's inner loops should be long.
-        numbers = np.multiply.outer(steps.astype(np.uint32), step)
-        numbers += start
+        step = steps.astype(np.uint32).reshape(-1, *[1] * corners.ndim)
+        numbers = np.where(self._are_lowest(corners), step - 1, self.rate - 1 - step)
+        numbers += self.edge_start(corners).astype(np.uint32)
         if (steps == 0).any():
             numbers[steps == 0] = self._at_corners(corners)
         if (steps == self.rate).any():
@@ -205,7 +197,7 @@ class UniformGrid:
     def triangle_counts(self) -> IntArray:
         """``(n_f,)`` triangles of each element."""
         of_whole = (self.domain.corner_count - 2) * self.rate**2
-        return np.where(self._is_whole, of_whole, self.topology.face_sizes * self._corner_triangles)
+        return np.where(self._is_whole, of_whole, self.topology.face_sizes * len(self._corner_cells))
 
     def triangles(self) -> NDArray[np.uint32]:
         """``(m, 3)`` vertices, counter-clockwise from outside, in the order of the elements."""
@@ -220,10 +212,13 @@ class UniformGrid:
                 np.take(vertices, cells.ravel(), axis=1, out=target, mode="clip")
             else:
                 triangles[start[faces][:, None] + np.arange(len(cells))] = vertices[:, cells]
+        cells = self._corner_cells
         for corners in _slices(t.half_edges_of(~self._is_whole), self._half**2 + 1):
             face = t.face[corners]
-            first = start[face] + (corners - t.face_offsets[face]) * self._corner_triangles
-            triangles[first[:, None] + np.arange(self._corner_triangles)] = self._triangles_of_corners(corners)
+            first = start[face] + (corners - t.face_offsets[face]) * len(cells)
+            grids, following = self._corner_vertices(corners), self._corner_vertices(t.next[corners])[:, -1]
+            vertices = np.column_stack([grids.reshape(len(corners), -1), following, self.inner_start[face]])
+            triangles[first[:, None] + np.arange(len(cells))] = vertices[:, cells]
         return triangles
 
     @cached_property
@@ -236,19 +231,19 @@ class UniformGrid:
             cells.append(self._sample_at(self._steps[room >= least][:, None] + np.array(corners)).T)
         return np.concatenate(cells)
 
-    def _triangles_of_corners(self, corners: IntArray) -> NDArray[np.uint32]:
-        """``(c, n, 3)`` triangles of each polygon corner."""
-        grids, count = self._corner_vertices(corners), self._half + 1
-        parts = [grids.reshape(len(corners), -1)[:, _cut_cells(count, count)]]
-        if self._is_odd:
-            # A strip across the midpoint of the common edge joins the next corner's grid.
-            t = self.topology
-            following = self._corner_vertices(t.next[corners])[:, -1, :]
-            strip = np.stack([grids[:, :, -1], following], axis=2).reshape(len(corners), -1)
-            centre = self.inner_start[t.face[corners]].astype(np.uint32)
-            parts.append(strip[:, _cut_cells(count, 2)])
-            parts.append(np.stack([grids[:, -1, -1], following[:, -1], centre], axis=1)[:, None])
-        return np.concatenate(parts, axis=1)
+    @cached_property
+    def _corner_cells(self) -> IntArray:
+        """``(T, 3)`` samples at the corners of each triangle of one corner of a polygon.
+
+        Samples are those of the corner's grid, then the last row of the next corner's grid, which a strip across the
+        midpoint of the common edge joins for an odd rate, and the polygon's centre.
+        """
+        count = self._half + 1
+        cells, beyond = _cut_cells(count, count), count**2 + np.arange(count)
+        if not self._is_odd:
+            return cells
+        strip = np.stack([np.arange(count) * count + self._half, beyond], axis=1).ravel()
+        return np.concatenate([cells, strip[_cut_cells(count, 2)], [[count**2 - 1, beyond[-1], beyond[-1] + 1]]])
 
     def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
         """Parameters at the corners of an element's triangles.
@@ -264,14 +259,10 @@ class UniformGrid:
         whole = (self._steps / self.rate)[self._whole_cells]
         if self.domain.corner_count == 3:
             return whole, np.empty((0, 3, 2))
-        rows, count = self._corner_parameters, self._half + 1
-        parts = [rows.reshape(-1, 2)[_cut_cells(count, count)]]
-        if self._is_odd:
-            # In this corner's parameters, the last row of the next corner's grid is a column beyond u = 1.
-            beyond = np.stack([2 - rows[-1, :, 1], rows[-1, :, 0]], axis=1)
-            strip = np.stack([rows[:, -1], beyond], axis=1).reshape(-1, 2)
-            parts += [strip[_cut_cells(count, 2)], np.stack([rows[-1, -1], beyond[-1], np.ones(2)])[None]]
-        return whole, np.concatenate(parts)
+        grid = self._corner_parameters
+        # In this corner's parameters, the last row of the next corner's grid is a column beyond u = 1.
+        beyond = np.stack([2 - grid[-1, :, 1], grid[-1, :, 0]], axis=1)
+        return whole, np.concatenate([grid.reshape(-1, 2), beyond, [[1.0, 1.0]]])[self._corner_cells]
 
     @property
     def _corner_parameters(self) -> FloatArray:
