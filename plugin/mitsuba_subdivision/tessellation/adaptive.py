@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..cage.errors import warn
 from ..evaluation.divided_tile import DividedTile, part_of_tile
@@ -49,18 +48,9 @@ def adaptive_table(
     max_rate = checked_rate(max_rate, "max_rate")
     if max_rate > HIGHEST_RATE:
         raise ValueError(f"max_rate {max_rate}; expected at most {HIGHEST_RATE} segments per edge")
-    frames, points = PatchFrames.of(patches, control_of_vertex), control_points[control_of_vertex]
+    frames = PatchFrames.of(patches, control_of_vertex)
     rates = TileRates(patches.scheme, frames, criterion, max_rate)
-    features = feature_edges(patches, frames, points, criterion)
-    none = np.empty(0, dtype=tile_type(patches.scheme.domain.corner_count))
-    needed = np.concatenate([none, *_chosen(rates, _whole_patches(patches, frames, points, features))])
-    u, v = needed["origin"].T
-    needed = needed[np.lexsort((needed["is_flipped"], u, v, needed["depth"], needed["corner"]))]
-    tiles, most = needed.copy(), rates.most(needed)[:, None]
-    tiles["rates"], tiles["sides"] = np.minimum(needed["rates"], most), np.minimum(needed["sides"], most)
-    if criterion.outline is None:
-        _warn_of_coarse(patches, needed, tiles, max_rate, cage_name)
-    grid = AdaptiveGrid.of(tiles, frames)
+    grid = AdaptiveGrid.of(_chosen(patches, rates, control_points[control_of_vertex], cage_name), frames)
     controls, refinement = patches.control_rows(control_of_vertex, len(control_points))
     polynomials = _polynomials(patches, grid)
     return VertexTable(len(control_points), patches.patch_count, grid, polynomials, controls, grid.copies(), refinement)
@@ -87,6 +77,24 @@ def _polynomials(patches: PatchTable, grid: AdaptiveGrid) -> tuple[VertexPolynom
     return vertex_polynomials(table.scheme, table.classes, uv_of_class, runs)
 
 
+def _chosen(
+    patches: PatchTable,
+    rates: TileRates,
+    points: FloatArray,  # (n_v, 3) float64: at the vertices of the mesh
+    cage_name: str,
+) -> Tiles:
+    """Divide the patches of a cage into tiles, in the order of the elements, and choose their rates."""
+    none = np.empty(0, dtype=tile_type(patches.scheme.domain.corner_count))
+    needed = np.concatenate([none, *_divided(rates, _whole_patches(patches, rates, points))])
+    u, v = needed["origin"].T
+    needed = needed[np.lexsort((needed["is_flipped"], u, v, needed["depth"], needed["corner"]))]
+    tiles, most = needed.copy(), rates.most(needed)[:, None]
+    tiles["rates"], tiles["sides"] = np.minimum(needed["rates"], most), np.minimum(needed["sides"], most)
+    if rates.criterion.outline is None:
+        _warn_of_coarse(patches, needed, tiles, rates.max_rate, cage_name)
+    return tiles
+
+
 def _warn_of_coarse(patches: PatchTable, needed: Tiles, tiles: Tiles, max_rate: int, cage_name: str) -> None:
     """Warn if the rates of tiles are lower than needed."""
     is_coarse = (needed["rates"] != tiles["rates"]).any(axis=1) | (needed["sides"] != tiles["sides"]).any(axis=1)
@@ -105,21 +113,16 @@ def _warn_of_coarse(patches: PatchTable, needed: Tiles, tiles: Tiles, max_rate: 
     )
 
 
-def _whole_patches(
-    patches: PatchTable,
-    frames: PatchFrames,
-    points: FloatArray,  # (n_v, 3) float64: at the vertices of the mesh
-    features: NDArray[np.bool_],  # (n_h,) bool: `feature_edges`
-) -> Iterator[Part]:
+def _whole_patches(patches: PatchTable, rates: TileRates, points: FloatArray) -> Iterator[Part]:
     """Iterate over all patches, each as one tile."""
-    refined = patches.refined
+    refined, features = patches.refined, feature_edges(patches, rates.frames, points, rates.criterion)
     table, points = (patches, points) if refined is None else (refined.table, refined.matrix @ points)
     coordinates = np.ascontiguousarray(points.T)
     elements = patch_trees(table.scheme, [patch_class.signature for patch_class in table.classes])
     pairs = list(zip(table.classes, elements, strict=True))
     corners = [kind.corners if refined is None else refined.corners(kind) for kind in table.classes]
-    tiles = whole_patches(np.concatenate(corners), frames.domain.corner_count)
-    half_edge = sides_of(tiles, frames, 0).half_edge.reshape(tiles["sides"].shape)
+    tiles = whole_patches(np.concatenate(corners), rates.frames.domain.corner_count)
+    half_edge = sides_of(tiles, rates.frames, 0).half_edge.reshape(tiles["sides"].shape)
     tiles["sides"] = (half_edge >= 0) & features[half_edge]
     for patch_class, element in counted(pairs, "Tiles of patch classes"):
         identity = np.eye(element.control_count)
@@ -131,7 +134,7 @@ def _whole_patches(
             yield Part(kind, block, values if rows is identity else times(rows, values))
 
 
-def _chosen(rates: TileRates, patches: Iterable[Part]) -> Iterator[Tiles]:
+def _divided(rates: TileRates, patches: Iterable[Part]) -> Iterator[Tiles]:
     """Iterate over the tiles of all patches, with their rates. Raises MemoryError if there are too many triangles."""
     # Tiles wait by kind, as one call bounds many tiles of a kind in little more time than one of them.
     waiting: dict[DividedTile, list[Part]] = {}
