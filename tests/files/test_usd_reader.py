@@ -1,7 +1,6 @@
 """USD control cages, read and written."""
 
 import re
-import struct
 from dataclasses import replace
 
 import numpy as np
@@ -417,31 +416,17 @@ def test_messages_are_short(read):
         assert len(str(caught.value)) < 600
 
 
-def test_files_without_meshes(tmp_path):
-    (tmp_path / "none.usda").write_text('#usda 1.0\ndef Sphere "ball" {}\n')
-    with pytest.raises(CageError, match=r'none\.usda": there are no meshes; expected a prim of the type Mesh'):
-        ControlCage.from_file(tmp_path / "none.usda")
-
-
 @pytest.mark.parametrize("suffix", [".usd", ".usda", ".usdc", ".usdz"])
-def test_malformed_files_name_the_file(tmp_path, suffix):
+def test_malformed_files_and_those_without_meshes_name_the_file(tmp_path, suffix):
     path = tmp_path / f"bad{suffix}"
     for content in (b"", b"#usda 1.0\ndef Mesh {", b"PXR-USDC" + bytes(20)):
         path.write_bytes(content)
         with pytest.raises(CageError, match=rf'bad\{suffix}".*: .*expected a USD file'):
             ControlCage.from_file(path)
-
-
-@pytest.mark.parametrize("damage", [(8, bytes(7) + b"\x80"), (8, b"\xff"), (0, b"\x01")], ids=["far", "near", "count"])
-def test_damaged_fields_are_errors_that_name_the_file(tmp_path, damage):
-    cube().save(tmp_path / "cube.usdc")
-    content = (tmp_path / "cube.usdc").read_bytes()
-    (table,) = struct.unpack_from("<q", content, 16)
-    (begin,) = struct.unpack_from("<q", content, content.index(b"FIELDS", table) + 16)
-    at, new = begin + damage[0], damage[1]
-    (tmp_path / "bad.usdc").write_bytes(content[:at] + new + content[at + len(new) :])
-    with pytest.raises(CageError, match=r'bad\.usdc"'):
-        ControlCage.from_file(tmp_path / "bad.usdc")
+    if suffix == ".usda":
+        path.write_text('#usda 1.0\ndef Sphere "ball" {}\n')
+        with pytest.raises(CageError, match=r'bad\.usda": there are no meshes; expected a prim of the type Mesh'):
+            ControlCage.from_file(path)
 
 
 def test_syntax_errors_name_their_line_and_a_file_of_this_folder_by_its_name(read, tmp_path, monkeypatch):

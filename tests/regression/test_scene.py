@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from pathlib import Path
 from unittest.mock import Mock
 
 import mitsuba as mi
@@ -51,40 +50,18 @@ def test_instances_load_in_order(monkeypatch):
     assert [call.args[0].parallel for call in instantiate.call_args_list] == [True, False]
 
 
-EPYC = """processor\t: 0
-vendor_id\t: AuthenticAMD
-cpu family\t: {family}
-model\t\t: {model}
-model name\t: AMD EPYC
-flags\t\t: fpu vme
-
-processor\t: 1
-model name\t: another one
-"""
-ARM = """processor\t: 0
-BogoMIPS\t: 243.75
-CPU implementer\t: 0x41
-CPU architecture: 8
-CPU part\t: 0xd40
-
-processor\t: 1
-"""
+EPYC = "processor\t: 0\nvendor_id\t: AMD\ncpu family\t: 26\nmodel\t\t: 2\nmodel name\t: EPYC\nflags\t\t: fpu vme\n"
+ARM = "processor\t: 0\nBogoMIPS\t: 243.75\nCPU implementer\t: 0x41\nCPU architecture: 8\nCPU part\t: 0xd40\n"
 
 
 def test_processors_of_one_name_are_told_apart_and_those_without_have_numbers():
-    for family, model in ((26, 2), (25, 1)):
-        expected = f"AMD EPYC, cpu family {family}, model {model}"
-        assert scenes._first_of(EPYC.format(family=family, model=model)) == expected
-    assert scenes._first_of(ARM) == "CPU implementer 0x41, CPU architecture 8, CPU part 0xd40"
+    """By what systems say of their first one, which cannot be had of others here."""
+    another = "\nprocessor\t: 1\nmodel name\t: another one\n"
+    assert scenes._first_of(EPYC + another) == "EPYC, cpu family 26, model 2"
+    assert scenes._first_of(ARM + another) == "CPU implementer 0x41, CPU architecture 8, CPU part 0xd40"
     # A list of another form gives nothing.
     assert scenes._first_of("") == scenes._first_of("no colon\n") == ""
-    # This one.
-    result = scenes.environment("scalar_rgb")["processor"]
-    information = Path("/proc/cpuinfo")
-    if information.is_file():
-        assert result == scenes._first_of(information.read_text(encoding="utf-8", errors="replace"))
-    else:
-        assert result
+    assert scenes.environment("scalar_rgb")["processor"]
 
 
 SIZE = 8
