@@ -22,27 +22,24 @@ from typing import Any, NoReturn
 
 import mitsuba as mi
 
-# Constructor, destructor and type of the C++ exception that contains a Python error, in nanobind, the library of
-# Mitsuba's bindings.
-_ERROR, _NO_ERROR, _ERROR_TYPE = (
-    "_ZN8nanobind12python_errorC1Ev",
-    "_ZN8nanobind12python_errorD1Ev",
-    "_ZTIN8nanobind12python_errorE",
-)
-# Functions of nanobind: wrap a C++ object, set its ownership, destroy it; the C++ instance of a Python object, and the
-# size of a C++ type in bytes.
-_OBJECT_AT, _SET_STATE, _DESTRUCT = (
-    "_ZN8nanobind6detail17nb_inst_referenceEP11_typeobjectPvP7_object",
-    "_ZN8nanobind6detail17nb_inst_set_stateEP7_objectbb",
-    "_ZN8nanobind6detail16nb_inst_destructEP7_object",
-)
+# Functions and a type of nanobind, the library of Mitsuba's bindings: constructor, destructor and type of the C++
+# exception that contains a Python error; wrap a C++ object, set its ownership, destroy it.
+_NANOBIND = {
+    "error": "_ZN8nanobind12python_errorC1Ev",
+    "no_error": "_ZN8nanobind12python_errorD1Ev",
+    "error_type": "_ZTIN8nanobind12python_errorE",
+    "object_at": "_ZN8nanobind6detail17nb_inst_referenceEP11_typeobjectPvP7_object",
+    "set_state": "_ZN8nanobind6detail17nb_inst_set_stateEP7_objectbb",
+    "destruct": "_ZN8nanobind6detail16nb_inst_destructEP7_object",
+}
+# The C++ instance of a Python object, and the size of a C++ type in bytes
 _POINTER_OF, _SIZE_OF = "_ZN8nanobind6detail11nb_inst_ptrEP7_object", "_ZN8nanobind6detail12nb_type_sizeEP7_object"
 # Lowest bit of an address that differs between C++ objects, which are aligned to 16 bytes; used by `tag_of`.
 _LOWEST_BIT = 4
-# Upper bound of the size of this exception, in bytes.
+# Upper bound of the size of the exception, in bytes.
 _ERROR_SIZE = 128
 # Format strings of `PyObject_CallFunction`: seven 64-bit numbers, and two objects.
-_NUMBERS, _FAILURE = ctypes.c_char_p(b"KKKKKKK"), ctypes.c_char_p(b"OO")
+_NUMBERS, _TWO_OBJECTS = ctypes.create_string_buffer(b"KKKKKKK"), ctypes.create_string_buffer(b"OO")
 # The set of SIGINT, which C++ handles during a render. The handler allocates memory, so it must not interrupt an
 # allocation of Python: the signal is blocked while Python runs.
 _SIGNAL_SET = ctypes.create_string_buffer(128)
@@ -52,35 +49,62 @@ BEFORE = 2
 # Upper bound of the number of entries of a table. The table of Mitsuba's meshes has 66.
 _MOST_ENTRIES = 96
 
-# Machine code for functions that store their arguments in the frame: the first at `rbp` - 0x18, the sixth at `rbp` -
-# 0x40. The seventh is passed on the stack, at `rbp` + 0x10.
-_ENTER = bytes.fromhex("f30f1efa 55 4889e5 53 4154 4881ece0000000")  # endbr64; push rbp; ...; sub rsp, 0xe0
-_KEEP = bytes.fromhex("48897de8 488975e0 488955d8 48894dd0 4c8945c8 4c894dc0")  # mov [rbp - 0x18], rdi; ...
-_PUSH_SEVENTH = bytes.fromhex("4883ec08 ff7510")  # sub rsp, 8; push [rbp + 0x10]
-_PUSH_FIFTH_AND_SIXTH = bytes.fromhex("ff75c0 ff75c8")  # push [rbp - 0x40]; push [rbp - 0x38]
-_DROP_2, _DROP_4 = bytes.fromhex("4883c410"), bytes.fromhex("4883c420")  # add rsp, 16; add rsp, 32
-_LOAD = bytes.fromhex("488b45e8 488b88")  # mov rax, [rbp - 0x18]; mov rcx, [rax + ...], a 32-bit offset
-_COMPARE = bytes.fromhex("483b88")  # cmp rcx, [rax + ...], a 32-bit offset
-_JUMP_IF_EQUAL = bytes.fromhex("0f84")  # je, a 32-bit distance
-_FIRST_FOUR = bytes.fromhex("488b55e8 488b4de0 4c8b45d8 4c8b4dd0")  # mov rdx, [rbp - 0x18]; ...; mov r9, [rbp - 0x30]
-# mov eax, [rbp - 0x20]; shl eax, 12; and eax, 0xffff0000; or [rbp - 0x38], eax: add `tag_of` the second argument to the
-# fifth.
-_TAG_FIFTH = bytes.fromhex("8b45e0 c1e00c 250000ffff 0945c8")
-_LOAD_SIX = bytes.fromhex("488b7de8 488b75e0 488b55d8 488b4dd0 4c8b45c8 4c8b4dc0")  # mov rdi, [rbp - 0x18]; ...
-_NO_VECTORS = bytes.fromhex("31c0")  # xor eax, eax
-_IS_NULL = bytes.fromhex("4885c0")  # test rax, rax
-_STATE_OF_RESULT, _STATE = bytes.fromhex("89c3"), bytes.fromhex("89df")  # mov ebx, eax; mov edi, ebx
-_RESULT = bytes.fromhex("4889c7")  # mov rdi, rax
-_MADE, _KEEP_OBJECT = bytes.fromhex("488b75e8"), bytes.fromhex("48898528ffffff")  # mov rsi, [rbp - 0x18]; mov ..., rax
-# lea rdi, [rbp - 0xd8]; lea rsi, [rbp - 0xe0]; lea rdx, [rbp - 0xe8]: addresses of a type, an error and its traceback.
-_RAISED = bytes.fromhex("488dbd28ffffff 488db520ffffff 488d9518ffffff")
-_FAILED = bytes.fromhex("488b9520ffffff 488b8d18ffffff")  # mov rdx, [rbp - 0xe0]; mov rcx, [rbp - 0xe8]
-_KEPT = [bytes.fromhex(f"488bbd{low}ffffff") for low in ("28", "20", "18")]  # mov rdi, [rbp - 0xd8]; ...
-_KEEP_ERROR, _KEPT_ERROR = bytes.fromhex("4989c4 4889c7"), bytes.fromhex("4c89e7")  # mov r12, rax; ... mov rdi, r12
-_BLOCK = bytes.fromhex("31ff 488d9530ffffff")  # xor edi, edi; lea rdx, [rbp - 0xd0]
-_UNBLOCK = bytes.fromhex("bf02000000 488db530ffffff 31d2")  # mov edi, 2; lea rsi, [rbp - 0xd0]; xor edx, edx
-_LEAVE = bytes.fromhex("488b45e8 488d65f0 415c 5b 5d c3")  # mov rax, [rbp - 0x18]; lea rsp, [rbp - 0x10]; ...; ret
-_NEVER = bytes.fromhex("0f0b")  # ud2
+# Machine code for `_assembled`: instructions in hexadecimal digits, explained after ";", and its own words. A function
+# stores its arguments in the frame: the first at rbp - 0x18, the sixth at rbp - 0x40. The seventh is passed on the
+# stack, at rbp + 0x10.
+_ENTER = """
+f30f1efa 55 4889e5 53 4154 4881ece0000000 ; endbr64; push rbp; mov rbp, rsp; push rbx; push r12; sub rsp, 0xe0
+48897de8 488975e0 488955d8 48894dd0 4c8945c8 4c894dc0 ; mov [rbp - 0x18], rdi; ...; mov [rbp - 0x40], r9
+"""
+_LEAVE = """
+leave: 488b45e8 488d65f0 415c 5b 5d c3 ; mov rax, [rbp - 0x18]; lea rsp, [rbp - 0x10]; pop r12; pop rbx; pop rbp; ret
+"""
+# Unblocks signals: C++ runs again.
+_RELEASE = """
+89df call PyGILState_Release ; mov edi, ebx
+bf02000000 488db530ffffff 31d2 call pthread_sigmask ; mov edi, 2; lea rsi, [rbp - 0xd0]; xor edx, edx
+"""
+# Calls Python with all arguments, as seven 64-bit numbers, and releases its result.
+_CALL_PYTHON = f"""
+31ff 488d9530ffffff rsi signals call pthread_sigmask ; xor edi, edi; lea rdx, [rbp - 0xd0]
+call PyGILState_Ensure 89c3 ; mov ebx, eax
+rdi function rsi numbers 488b55e8 488b4de0 4c8b45d8 4c8b4dd0 ; mov rdx, [rbp - 0x18]; ...; mov r9, [rbp - 0x30]
+4883ec08 ff7510 ff75c0 ff75c8 ; sub rsp, 8; push [rbp + 0x10]; push [rbp - 0x40]; push [rbp - 0x38]
+31c0 call PyObject_CallFunction 4883c420 ; xor eax, eax; add rsp, 32
+4885c0 je failed 4889c7 call Py_DecRef ; test rax, rax; mov rdi, rax
+{_RELEASE}
+"""
+# Throws the error that Python has raised as a C++ exception: its type, value and traceback are at rbp - 0xd8 and below.
+_RAISE = f"""
+488dbd28ffffff 488db520ffffff 488d9518ffffff call PyErr_Fetch ; lea rdi, [rbp - 0xd8]; ...
+488dbd28ffffff 488db520ffffff 488d9518ffffff call PyErr_NormalizeException
+rdi fail rsi two_objects 488b9520ffffff 488b8d18ffffff ; mov rdx, [rbp - 0xe0]; mov rcx, [rbp - 0xe8]
+31c0 call PyObject_CallFunction ; xor eax, eax
+488bbd28ffffff call Py_DecRef 488bbd20ffffff call Py_DecRef 488bbd18ffffff call Py_DecRef ; mov rdi, [rbp - 0xd8]; ...
+rdi error_size call __cxa_allocate_exception 4989c4 4889c7 call error ; mov r12, rax; mov rdi, rax
+{_RELEASE}
+4c89e7 rsi error_type rdx no_error call __cxa_throw 0f0b ; mov rdi, r12; ud2
+"""
+# The original function before Python. After an exception, its result does not exist for C++: it is destructed without
+# freeing its memory.
+_CALL_ORIGINAL = "4883ec08 ff7510 call original 4883c410 ; sub rsp, 8; push [rbp + 0x10]; add rsp, 16"
+_SKIP_EQUAL = """
+488b45e8 488b88 +first 483b88 +second je leave ; mov rax, [rbp - 0x18]; mov rcx, [rax + first]; cmp rcx, [rax + second]
+"""
+_DESTRUCT_RESULT = """
+failed: rdi kind 488b75e8 rdx 0 call object_at 48898528ffffff ; mov rsi, [rbp - 0x18]; mov [rbp - 0xd8], rax
+488bbd28ffffff rsi 1 rdx 1 call set_state 488bbd28ffffff call destruct ; mov rdi, [rbp - 0xd8]
+488bbd28ffffff rsi 0 rdx 0 call set_state 488bbd28ffffff call Py_DecRef
+"""
+# Python before the original function. Adds `tag_of` the second argument to the fifth.
+_BEFORE = f"""
+{_ENTER} {_CALL_PYTHON}
+8b45e0 c1e00c 250000ffff 0945c8 ; mov eax, [rbp - 0x20]; shl eax, 12; and eax, 0xffff0000; or [rbp - 0x38], eax
+488b7de8 488b75e0 488b55d8 488b4dd0 4c8b45c8 4c8b4dc0 ; mov rdi, [rbp - 0x18]; ...; mov r9, [rbp - 0x40]
+{_CALL_ORIGINAL} {_LEAVE}
+failed: {_RAISE}
+"""
+_MOVES = {"rdi": "48bf", "rsi": "48be", "rdx": "48ba", "r11": "49bb"}  # mov register, a 64-bit number
 
 # Unwind information. The canonical frame address is the stack pointer before the call; the return address is below it.
 _COMMON = bytes.fromhex("00000000 01 00 01 78 10 0c0708 9001 0000")
@@ -97,7 +121,7 @@ def bindings() -> ctypes.PyDLL:
     library, address = ctypes.PyDLL(str(Path(mi.__file__).parent / "libnanobind-drjit.so")), ctypes.c_void_p
     for name, result, arguments in (
         (_POINTER_OF, address, [ctypes.py_object]),
-        (_OBJECT_AT, ctypes.py_object, [ctypes.py_object, address, address]),
+        (_NANOBIND["object_at"], ctypes.py_object, [ctypes.py_object, address, address]),
         (_SIZE_OF, ctypes.c_size_t, [ctypes.py_object]),
         ("__cxa_demangle", address, [ctypes.c_char_p, *[address] * 3]),
     ):
@@ -118,7 +142,7 @@ def address_of(instance: object) -> int:
 
 def object_at(kind: type, address: int) -> Any:
     """Python object of a type for the C++ instance at an address."""
-    return getattr(bindings(), _OBJECT_AT)(kind, address, None)
+    return getattr(bindings(), _NANOBIND["object_at"])(kind, address, None)
 
 
 def offsets(structure: Any, *names: str) -> tuple[int, ...]:
@@ -209,8 +233,7 @@ def calling_before(
 
     It adds the tag of the second argument, a C++ object, to the fifth argument, a number below 2¹⁶.
     """
-    rest = _answered() + _TAG_FIFTH + _LOAD_SIX + _PUSH_SEVENTH + _call(original) + _DROP_2 + _LEAVE
-    return _installed(_ENTER + _KEEP + _ask(function) + _jump_if_equal(len(rest)) + rest + _raise(), function)
+    return _installed(_assembled(_BEFORE, original=original, function=id(function)), function)
 
 
 def tag_of(address: int) -> int:
@@ -249,14 +272,9 @@ def _installed(code: bytes, *used: Any) -> int:
 
 def _writable_page() -> int:
     """Allocate a page of memory, never freed, and return its address."""
-    allocate = _c_library().mmap
-    allocate.restype = ctypes.c_void_p
-    allocate.argtypes = [ctypes.c_void_p, ctypes.c_size_t, *[ctypes.c_int] * 3, ctypes.c_long]
-    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
-    address = allocate(None, mmap.PAGESIZE, mmap.PROT_READ | mmap.PROT_WRITE, flags, -1, 0)
-    if address == ctypes.c_void_p(-1).value:
-        raise OSError(ctypes.get_errno(), "no memory for machine code")
-    return int(address)
+    page = mmap.mmap(-1, mmap.PAGESIZE, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(page))
+    return ctypes.addressof(ctypes.c_char.from_buffer(page))
 
 
 def _protect(page: int, allowed: int) -> None:
@@ -266,69 +284,51 @@ def _protect(page: int, allowed: int) -> None:
         raise OSError(ctypes.get_errno(), "memory cannot be made executable, or a table writable")
 
 
-def _code_after(
-    original: int,
-    kind: type,
-    function: Callable[..., None],
-    equal: tuple[int, ...] | None,
-) -> bytes:
+def _code_after(original: int, kind: type, function: Callable[..., None], equal: tuple[int, ...] | None) -> bytes:
     """Machine code of `calling_after`."""
-    library = bindings()
-    set_state, destruct = _call(library[_SET_STATE]), _call(library[_DESTRUCT])
-    on_error = [
-        # After an exception, the object does not exist for C++: destruct it, without freeing its memory.
-        _move("rdi", id(kind)) + _MADE + _move("rdx", 0) + _call(library[_OBJECT_AT]) + _KEEP_OBJECT,
-        _KEPT[0] + _move("rsi", 1) + _move("rdx", 1) + set_state + _KEPT[0] + destruct,
-        _KEPT[0] + _move("rsi", 0) + _move("rdx", 0) + set_state + _KEPT[0] + _call(ctypes.pythonapi.Py_DecRef),
-        _raise(),
-    ]
-    call_python = _ask(function) + _jump_if_equal(len(_answered() + _LEAVE)) + _answered()
-    skip_python = b""
-    if equal is not None:
-        first, second = (struct.pack("<i", offset) for offset in equal)
-        skip_python = _LOAD + first + _COMPARE + second + _jump_if_equal(len(call_python))
-    call_original = _ENTER + _KEEP + _PUSH_SEVENTH + _call(original) + _DROP_2
-    return call_original + skip_python + call_python + _LEAVE + b"".join(on_error)
+    first, second = equal or (0, 0)
+    parts = _ENTER, _CALL_ORIGINAL, _SKIP_EQUAL if equal else "", _CALL_PYTHON, _LEAVE, _DESTRUCT_RESULT, _RAISE
+    values = {"original": original, "kind": id(kind), "function": id(function), "first": first, "second": second}
+    return _assembled("\n".join(parts), **values)
 
 
-def _ask(function: Callable[..., None]) -> bytes:
-    """Call Python with all arguments, and compare its result with NULL."""
-    library, python = bindings(), ctypes.pythonapi
+def _assembled(text: str, **values: int) -> bytes:
+    """Machine code of a text of hexadecimal digits and of words.
+
+    - ``NAME:`` is where ``je NAME`` jumps if the last comparison found equality.
+    - A register and a value: ``mov register, value``. ``call`` and a value: ``mov r11, value; call r11``.
+    - ``+NAME`` is a value of 32 bits.
+
+    Values are numbers, names in ``values``, and functions of Python and of the libraries.
+    """
     _c_library().sigaddset(_SIGNAL_SET, int(signal.SIGINT))
-    block = _BLOCK + _move("rsi", ctypes.addressof(_SIGNAL_SET)) + _call(library["pthread_sigmask"])
-    enter = _call(python.PyGILState_Ensure) + _STATE_OF_RESULT
-    arguments = _move("rdi", id(function)) + _move("rsi", _NUMBERS) + _FIRST_FOUR
-    call = _PUSH_SEVENTH + _PUSH_FIFTH_AND_SIXTH + _NO_VECTORS + _call(python.PyObject_CallFunction) + _DROP_4
-    return block + enter + arguments + call + _IS_NULL
+    constants = {"signals": _SIGNAL_SET, "numbers": _NUMBERS, "two_objects": _TWO_OBJECTS}
+    values |= {name: ctypes.addressof(constant) for name, constant in constants.items()}
+    values |= {"0": 0, "1": 1, "error_size": _ERROR_SIZE, "fail": id(_fail)}
 
+    def value(name: str) -> bytes:
+        if name not in values:
+            library = ctypes.pythonapi if name.startswith("Py") else bindings()
+            values[name] = ctypes.cast(library[_NANOBIND.get(name, name)], ctypes.c_void_p).value or 0
+        return struct.pack("<Q", values[name])
 
-def _answered() -> bytes:
-    """Release the result of Python and the interpreter."""
-    return _RESULT + _call(ctypes.pythonapi.Py_DecRef) + _release()
-
-
-def _raise() -> bytes:
-    """Throw the error that Python has raised as a C++ exception."""
-    library, python = bindings(), ctypes.pythonapi
-    return b"".join(
-        [
-            _RAISED + _call(python.PyErr_Fetch) + _RAISED + _call(python.PyErr_NormalizeException),
-            _move("rdi", id(_fail)) + _move("rsi", _FAILURE) + _FAILED + _NO_VECTORS,
-            _call(python.PyObject_CallFunction),
-            *[kept + _call(ctypes.pythonapi.Py_DecRef) for kept in _KEPT],
-            _move("rdi", _ERROR_SIZE) + _call(library["__cxa_allocate_exception"]),
-            _KEEP_ERROR + _call(library[_ERROR]),
-            _release(),
-            _KEPT_ERROR + _move("rsi", library[_ERROR_TYPE]) + _move("rdx", library[_NO_ERROR]),
-            _call(library["__cxa_throw"]) + _NEVER,
-        ]
-    )
-
-
-def _release() -> bytes:
-    """Release the interpreter and unblock signals."""
-    release = _STATE + _call(ctypes.pythonapi.PyGILState_Release)
-    return release + _UNBLOCK + _call(bindings()["pthread_sigmask"])
+    code, places, jumps = bytearray(), {}, []
+    words = (word for line in text.splitlines() for word in line.partition(";")[0].split())
+    for word in words:
+        if word.endswith(":"):
+            places[word[:-1]] = len(code)
+        elif word == "je":
+            code += bytes.fromhex("0f84") + bytes(4)
+            jumps.append((len(code), next(words)))
+        elif word == "call":
+            code += bytes.fromhex(_MOVES["r11"]) + value(next(words)) + bytes.fromhex("41ffd3")
+        elif word in _MOVES:
+            code += bytes.fromhex(_MOVES[word]) + value(next(words))
+        else:
+            code += struct.pack("<i", values[word[1:]]) if word.startswith("+") else bytes.fromhex(word)
+    for end, name in jumps:
+        code[end - 4 : end] = struct.pack("<i", places[name] - end)
+    return bytes(code)
 
 
 def _frame_description(address: int, size: int) -> bytes:
@@ -336,22 +336,6 @@ def _frame_description(address: int, size: int) -> bytes:
     common = struct.pack("<I", len(_COMMON)) + _COMMON
     description = struct.pack("<IQQ", len(common) + 4, address, size) + _FRAME
     return common + struct.pack("<I", len(description)) + description + bytes(4)
-
-
-def _move(register: str, value: Any) -> bytes:
-    """``mov register, value``: a number, or the address of an object of ctypes."""
-    number = value if isinstance(value, int) else ctypes.cast(value, ctypes.c_void_p).value or 0
-    opcodes = {"rdi": "48bf", "rsi": "48be", "rdx": "48ba", "r11": "49bb"}
-    return bytes.fromhex(opcodes[register]) + struct.pack("<Q", number)
-
-
-def _call(function: Any) -> bytes:
-    """``mov r11, function; call r11``."""
-    return _move("r11", function) + bytes.fromhex("41ffd3")
-
-
-def _jump_if_equal(distance: int) -> bytes:
-    return _JUMP_IF_EQUAL + struct.pack("<i", distance)
 
 
 # Errors
