@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop, StencilTable
+from mitsuba_subdivision.evaluation.patch_tree import irregular_patch, isolated_signature
+from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop, StencilTable, scheme_named
 from reference.bars import CURVATURE, CURVATURE_LEVELS, DERIVATIVE, NORMAL, POINT, SECOND_DERIVATIVE
 from reference.exact_samples import SCHEMES, angle, curvature_error
 from scipy.sparse import csr_array
@@ -18,26 +19,26 @@ def inside(scheme, rng, count=300):
     return rng.dirichlet(np.ones(scheme.domain.corner_count), count) @ scheme.domain.corners
 
 
-def curvatures(found):
-    return np.stack([found.gaussian_curvature, found.mean_curvature])
+def curvatures(samples):
+    return np.stack([samples.gaussian_curvature, samples.mean_curvature])
 
 
-def seconds(found):
-    return np.stack([found.d2p_duu, found.d2p_duv, found.d2p_dvv])
+def seconds(samples):
+    return np.stack([samples.d2p_duu, samples.d2p_duv, samples.d2p_dvv])
 
 
-def assert_exact(found, exact, chosen=slice(None), curvature_levels=CURVATURE_LEVELS):
+def assert_exact(samples, exact, chosen=slice(None), curvature_levels=CURVATURE_LEVELS):
     """Points, normals and all derivatives that were asked for, at all samples or some chosen ones."""
-    scale = exact.derivative_scale(found.level)[:, None] * exact.size
-    assert np.abs(found.p - exact.p[chosen]).max() <= POINT * exact.size
-    assert np.abs((found.dp_du - exact.dp_du[chosen]) / scale).max() <= DERIVATIVE
-    assert np.abs((found.dp_dv - exact.dp_dv[chosen]) / scale).max() <= DERIVATIVE
-    assert angle(found.n, exact.n[chosen]).max() <= NORMAL
-    if found.d2p_duu is not None:
-        scale = exact.derivative_scale(found.level, 2)[:, None] * exact.size
-        assert np.abs((seconds(found) - exact.second[:, chosen]) / scale).max() <= SECOND_DERIVATIVE
-        near = found.level <= curvature_levels
-        error = curvature_error(curvatures(found)[:, near], exact.curvature[:, chosen][:, near])
+    scale = exact.derivative_scale(samples.level)[:, None] * exact.size
+    assert np.abs(samples.p - exact.p[chosen]).max() <= POINT * exact.size
+    assert np.abs((samples.dp_du - exact.dp_du[chosen]) / scale).max() <= DERIVATIVE
+    assert np.abs((samples.dp_dv - exact.dp_dv[chosen]) / scale).max() <= DERIVATIVE
+    assert angle(samples.n, exact.n[chosen]).max() <= NORMAL
+    if samples.d2p_duu is not None:
+        scale = exact.derivative_scale(samples.level, 2)[:, None] * exact.size
+        assert np.abs((seconds(samples) - exact.second[:, chosen]) / scale).max() <= SECOND_DERIVATIVE
+        near = samples.level <= curvature_levels
+        error = curvature_error(curvatures(samples)[:, near], exact.curvature[:, chosen][:, near])
         assert error.max() <= CURVATURE
 
 
@@ -49,20 +50,21 @@ def evaluate_from(surface, half_edge, uv):
 
 
 def both_sides(surface, half_edge, along):
-    """What either face finds along edges of the cage, creases included, that begin at half-edges."""
+    """Samples of either face along edges of the cage, creases included, that begin at half-edges."""
     for side, u in ((half_edge, along), (surface.cage.topology.twin[half_edge], 1 - along)):
         yield evaluate_from(surface, side, np.stack([u, np.zeros_like(u)], axis=1))
 
 
-def patch_table_of(surface):
-    """The patches that are evaluated: those of the refined cage, if it is refined first."""
-    return surface.patches if surface.patches.refined is None else surface.patches.refined.table
+def patch_of(scheme, valence):
+    """The irregular patch at an isolated extraordinary point."""
+    scheme = scheme_named(scheme)
+    return irregular_patch(scheme, isolated_signature(scheme, valence))
 
 
 def classes(surface):
-    """The scheme and the signatures of its patches."""
-    table = patch_table_of(surface)
-    return table.scheme, [each.signature for each in table.classes]
+    """The scheme and the signatures of its patches, or those of the refined cage if it is refined first."""
+    table = surface.patches if surface.patches.refined is None else surface.patches.refined.table
+    return table.scheme, [patch_class.signature for patch_class in table.classes]
 
 
 class ChangedCatmullClark(CatmullClark):

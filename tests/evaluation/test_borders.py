@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from evaluation.common import both_sides, evaluate_from
 from mitsuba_subdivision import CageError, ControlCage, LimitSurface, SchemeError
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
 from mitsuba_subdivision.evaluation import irregular_patch, patch_tree
-from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.mesh.connectivity import VertexRule
+from patches.closed_cages import cube_with_valence_2
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import (
     differences_to_refined,
@@ -77,22 +77,13 @@ def test_one_refinement_has_the_same_surface(scheme, cage, np_rng):
     assert normals <= NORMAL
 
 
-@EVERY_CAGE
-def test_weights_of_points_sum_to_one_and_those_of_tangents_to_zero(scheme, cage, np_rng):
-    surface = LimitSurface(cage, scheme)
-    uv = np.concatenate([[[0, 0], [1, 0], [0, 1]], np_rng.random((12, 2)) / 2.0 ** np.arange(1, 13)[:, None]])
-    for patch_class in surface.patches.classes:
-        weights = element_stencils(surface.scheme, patch_class.signature, uv)
-        np.testing.assert_allclose(weights[0].sum(axis=1), 1, rtol=0, atol=WEIGHTS)
-        np.testing.assert_allclose(weights[1:].sum(axis=2), 0, rtol=0, atol=WEIGHTS)
-
-
 def at_corners(surface, rng):
     """Elements, parameters and corners: corners themselves, and places near them."""
-    element = np.arange(surface.cage.face_count).repeat(4)
+    sizes = surface.patches.elements.face_sizes
+    element = np.arange(len(sizes)).repeat(4)
     uv = rng.random((len(element), 2)) / 2 * 2.0 ** -rng.integers(0, 12, (len(element), 1))
     uv[::2] = 0
-    return element, uv, rng.integers(0, surface.cage.face_sizes[element])
+    return element, uv, rng.integers(0, sizes[element])
 
 
 def with_vectors_turned_over(basis, rng):
@@ -103,7 +94,15 @@ def with_vectors_turned_over(basis, rng):
     return replace(basis, vectors=basis.vectors * sign, inverse=basis.inverse * sign[:, None], blocks=blocks)
 
 
-@EVERY_CAGE
+BALLS = {
+    **{f"ball of valence {n}": ("catmull_clark", extraordinary(n)) for n in (3, 5, 8)},
+    **{f"loop ball of valence {n}": ("loop", extraordinary_triangles(n)) for n in (3, 5, 8)},
+    "doo_sabin ball": ("doo_sabin", extraordinary_face(5)),
+    "valence 2": ("catmull_clark", cube_with_valence_2()),
+}
+
+
+@pytest.mark.parametrize(("scheme", "cage"), (CAGES | BALLS).values(), ids=CAGES | BALLS)
 def test_signs_of_eigenvectors_do_not_matter(scheme, cage, np_rng, monkeypatch):
     surface = LimitSurface(with_bumps(cage), scheme)
     places = at_corners(surface, np_rng)
@@ -120,13 +119,13 @@ def test_signs_of_eigenvectors_do_not_matter(scheme, cage, np_rng, monkeypatch):
     monkeypatch.setattr(irregular_patch, "eigenbasis", turned)
     clear_caches()
     try:
-        found = surface.evaluate(*places)
+        samples = surface.evaluate(*places)
     finally:
         clear_caches()
-    assert np.abs(found.p - expected.p).max() <= POSITION
+    assert np.abs(samples.p - expected.p).max() <= POSITION
     for derivative in ("dp_du", "dp_dv"):
-        np.testing.assert_allclose(getattr(found, derivative), getattr(expected, derivative), rtol=0, atol=WEIGHTS)
-    assert angle(found.n, expected.n).max() <= NORMAL
+        np.testing.assert_allclose(getattr(samples, derivative), getattr(expected, derivative), rtol=0, atol=WEIGHTS)
+    assert angle(samples.n, expected.n).max() <= NORMAL
 
 
 @EVERY_CAGE
@@ -141,29 +140,14 @@ def test_refined_vertices_approach_the_surface(scheme, cage):
     assert errors[1] < 0.1
 
 
-@EVERY_CAGE
-def test_a_tessellation_cracks_nowhere(scheme, cage):
-    surface = LimitSurface(with_bumps(cage), scheme)
-    found = surface.tessellate(3)
-    assert np.isfinite(found.positions).all()
-    assert np.isfinite(found.normals).all()
-    # Welded by their positions, bit by bit, triangles meet in pairs but on the cage's own border.
-    _, same = np.unique(found.positions, axis=0, return_inverse=True)
-    triangles = same.ravel()[found.triangles]
-    edges = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
-    _, counts = np.unique(edges, axis=0, return_counts=True)
-    assert set(counts) <= {1, 2}
-    assert (counts == 1).sum() == 3 * (cage.topology.twin < 0).sum()
-
-
 def test_a_border_is_a_cubic_spline_between_its_corners():
     cage = with_bumps(sheet(3, 1))
     t = np.linspace(0, 1, 9)
-    found = LimitSurface(cage).evaluate(1, np.stack([t, np.zeros_like(t)], axis=1)).p
+    points = LimitSurface(cage).evaluate(1, np.stack([t, np.zeros_like(t)], axis=1)).p
     a, b, c, d = cage.positions[:4]
     s = 1 - t
     weights = np.stack([s**3, 3 * t**3 - 6 * t**2 + 4, 3 * s**3 - 6 * s**2 + 4, t**3]) / 6
-    assert np.abs(found - weights.T @ [a, b, c, d]).max() <= POSITION
+    assert np.abs(points - weights.T @ [a, b, c, d]).max() <= POSITION
 
 
 def test_corners_stay_and_other_ends_of_the_border_do_not():
@@ -273,8 +257,8 @@ def test_wrong_tags_are_errors_that_say_where(options, message):
 
 
 def test_doo_sabin_ends_at_the_faces_of_the_border_and_needs_an_inner_vertex():
-    found = LimitSurface(sheet(3, 3), "doo_sabin").tessellate(2).positions
-    np.testing.assert_allclose(found.min(axis=0), [0.5, 0.5, 0], rtol=0, atol=POSITION)
-    np.testing.assert_allclose(found.max(axis=0), [2.5, 2.5, 0], rtol=0, atol=POSITION)
+    points = LimitSurface(sheet(3, 3), "doo_sabin").tessellate(2).positions
+    np.testing.assert_allclose(points.min(axis=0), [0.5, 0.5, 0], rtol=0, atol=POSITION)
+    np.testing.assert_allclose(points.max(axis=0), [2.5, 2.5, 0], rtol=0, atol=POSITION)
     with pytest.raises(SchemeError, match="the scheme doo_sabin makes no surface of a cage without inner vertices"):
         LimitSurface(sheet(3, 1), "doo_sabin")

@@ -11,6 +11,7 @@ from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordin
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.schemes import CatmullClark
+from patches.closed_cages import prism
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import differences_to_refined, refined, sheet, spokes, tagged, upper_half, with_bumps
 from reference.refinement import SharpMesh
@@ -27,8 +28,8 @@ BALLS = {"catmull_clark": cube(), "loop": ControlCage(*octahedron())}
 
 def ring(*sharpness, **options):
     """A cube with creases around its top, of one sharpness or of one each."""
-    each = zip(TOP, sharpness * 4 if len(sharpness) == 1 else sharpness, strict=True)
-    return tagged(cube(), creases=[(a, b, s) for (a, b), s in each], **options)
+    edges = zip(TOP, sharpness * 4 if len(sharpness) == 1 else sharpness, strict=True)
+    return tagged(cube(), creases=[(a, b, s) for (a, b), s in edges], **options)
 
 
 def sharp_ball(scheme, sharpness, spread, method, **options):
@@ -50,6 +51,7 @@ CAGES = {
     "along a border and from it": ("catmull_clark", sheet(3, 3, creases=[(1, 2, 0.7), (2, 3, 2.5), (2, 6, 1.5)])),
     "crease into a border": ("catmull_clark", sheet(3, 3, creases=[(1, 5, 1.5), (5, 9, 0.5)])),
     "pentagon": ("catmull_clark", tagged(upper_half(extraordinary_face(5)), creases=[(0, 1, 1.5), (1, 2, 0.7)])),
+    "smooth triangles": ("catmull_clark", tagged(prism(), triangle_rule="smooth")),
     "triangle sheet": ("loop", sheet(3, 3, triangles=True, creases=[(5, 6, 1.5), (6, 10, 0.7)], corners=[(9, 1.2)])),
 }
 for kind, sharpness in {
@@ -122,27 +124,15 @@ def test_sharpness_10_is_infinite_and_9_nearly():
 def test_a_vertex_of_sharpness_10_stays_and_one_of_9_nearly(scheme):
     for sharpness, stays in ((10, True), (9, False)):
         surface = LimitSurface(tagged(BALLS[scheme], corners=[(0, sharpness)]), scheme)
-        found = evaluate_from(surface, surface.cage.topology.vertex_half_edge[:1], [[0.0, 0.0]])
-        moved = np.abs(found.p[0] - surface.cage.positions[0]).max()
+        at_vertex = evaluate_from(surface, surface.cage.topology.vertex_half_edge[:1], [[0.0, 0.0]])
+        moved = np.abs(at_vertex.p[0] - surface.cage.positions[0]).max()
         # A cusp draws near its tip more slowly than by halves.
         assert (moved <= POSITION) if stays else (1e-5 < moved < 2e-2)
 
 
-def test_greater_sharpness_pulls_further():
-    heights = [LimitSurface(ring(s)).tessellate(8).positions[:, 2].mean() for s in (0, *LADDER)]
-    assert (np.diff(heights) > 0).all()
-
-
-@pytest.mark.core
-def test_smooth_triangles_are_those_of_the_rules_and_differ():
-    cage = with_bumps(tagged(BALLS["loop"], triangle_rule="smooth"))
-    surface, slow = LimitSurface(cage), slow_mesh("catmull_clark", cage)
-    for _ in range(3):
-        surface, slow = refined(surface), slow.refined()
-        expected = slow.points[np.concatenate(slow.faces)]
-        assert np.abs(surface.cage.positions[surface.cage.face_vertices] - expected).max() <= POSITION * 10
-    usual = LimitSurface(tagged(cage))
-    assert np.abs(LimitSurface(cage).tessellate(2).positions - usual.tessellate(2).positions).max() > 1e-3
+def test_smooth_triangles_differ():
+    smooth, usual = (LimitSurface(tagged(BALLS["loop"], triangle_rule=rule)) for rule in ("smooth", "catmull_clark"))
+    assert np.abs(smooth.tessellate(2).positions - usual.tessellate(2).positions).max() > 1e-3
 
 
 def test_rules_that_change_nothing_keep_the_scheme():
@@ -173,15 +163,15 @@ def test_a_scheme_without_rules_for_sharpness_refuses_it(scheme, sharpness, mess
         LimitSurface(tagged(cube(), creases=[(0, 1, sharpness)]), scheme)
 
 
-def assert_part(found, whole, faces):
+def assert_part(part, whole, faces):
     """That a tessellation is that of some faces of another."""
-    assert set(found.element) == faces
+    assert set(part.element) == faces
     kept = whole.triangles[np.isin(whole.element, list(faces))]
     # Another patch may be the one that evaluates what they share with others.
-    assert np.abs(found.positions[found.triangles] - whole.positions[kept]).max() <= POSITION
-    assert np.abs(found.normals[found.triangles] - whole.normals[kept]).max() <= POSITION
+    assert np.abs(part.positions[part.triangles] - whole.positions[kept]).max() <= POSITION
+    assert np.abs(part.normals[part.triangles] - whole.normals[kept]).max() <= POSITION
     # No vertex is left that no triangle uses.
-    assert len(np.unique(found.triangles)) == len(found.positions)
+    assert len(np.unique(part.triangles)) == len(part.positions)
 
 
 @pytest.mark.core
@@ -295,8 +285,8 @@ class LastingCreases(CatmullClark):
         t = refinement.topology
         if t.semi_sharpness is None:
             return refinement
-        sharpness = {each: getattr(t.semi_sharpness, each) for each in ("edges", "edges_refined")}
-        semi = replace(t.semi_sharpness, **{each: np.where(s > 0, 2.5, 0) for each, s in sharpness.items()})
+        sharpness = {name: getattr(t.semi_sharpness, name) for name in ("edges", "edges_refined")}
+        semi = replace(t.semi_sharpness, **{name: np.where(s > 0, 2.5, 0) for name, s in sharpness.items()})
         return refinement._replace(topology=t.with_rules(t.vertex_rules, semi))
 
 
