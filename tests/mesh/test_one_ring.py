@@ -1,12 +1,10 @@
-from itertools import product
-
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
+from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.mesh import ragged
 from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import Fan, Signature, signature_at
-from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, mixed_torus, polygons
+from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, polygons
 from reference.exact_samples import mesh_of
 from reference.refined_cages import sheet, tagged
 
@@ -15,13 +13,6 @@ pytestmark = pytest.mark.core
 # Two polygons back to back: every vertex has valence 2, and the faces share all their edges.
 PILLOWS = {f"pillow {n}": mesh_of(n, [range(n), range(n - 1, -1, -1)]) for n in (3, 4, 5)}
 TOPOLOGIES = {name: make().topology for name, make in CLOSED_CAGES.items()} | PILLOWS
-# In these, a one-ring holds no vertex twice.
-LARGE = {
-    "mixed torus": mixed_torus().topology,
-    "torus": torus(6, 7).topology,
-    "valence 3": extraordinary(3).topology,
-    "valence 6": extraordinary(6).topology,
-}
 
 
 def half_edges_of(topology, most=80):
@@ -38,26 +29,11 @@ WITH_SHEETS = TOPOLOGIES | {"sheet": sheet(3, 2).topology, "triangle sheet": she
 EVERY_KIND = pytest.mark.parametrize("kind", ["face", "vertex"])
 
 
-def quads_at(*valences):
-    return Signature("face", tuple(Fan((4,) * n) for n in valences))
-
-
 def element_vertices(topology, half_edge, kind):
     face = polygons(topology)[topology.face[half_edge]]
     turn = half_edge - topology.face_offsets[topology.face[half_edge]]
     turned = face[turn:] + face[:turn]
     return turned if kind == "face" else turned[:1]
-
-
-def test_quad_has_twice_its_valences_less_16_control_points():
-    for valences in (*product((3, 4, 5, 7), repeat=4), (2, 4, 3, 4), (2, 5, 2, 6), (30, 4, 4, 4)):
-        assert one_ring(quads_at(*valences)).vertex_count == 2 * sum(valences) - 16
-
-
-@pytest.mark.parametrize("fan", [(4,) * 3, (4,) * 7, (3, 5, 4, 6), (3, 3, 3)])
-def test_vertex_has_the_control_points_of_its_fan(fan):
-    # The centre, and of each face all vertices but the centre and one shared with the next face.
-    assert one_ring(Signature("vertex", (Fan(fan),))).vertex_count == 1 + sum(size - 2 for size in fan)
 
 
 @by_name(TOPOLOGIES)
@@ -100,19 +76,6 @@ def test_gathered_ring_is_a_map_of_meshes(topology, kind):
         np.testing.assert_array_equal(topology.twin[image[inner]], image[local.twin[inner]])
 
 
-@by_name(LARGE)
-@EVERY_KIND
-def test_gathered_ring_is_every_face_that_shares_a_vertex_once(topology, kind):
-    faces = polygons(topology)
-    for half_edge in half_edges_of(topology):
-        element = set(element_vertices(topology, half_edge, kind))
-        expected = sorted(sorted(f) for f in faces if not element.isdisjoint(f))
-        ring = one_ring(signature_at(topology, half_edge, kind))
-        controls = ring.gather(topology, np.array([half_edge]))[0]
-        assert sorted(sorted(controls[list(face)]) for face in polygons(ring.topology)) == expected
-        assert sorted(controls) == sorted({v for f in expected for v in f})
-
-
 @by_name(WITH_SHEETS)
 @EVERY_KIND
 def test_many_elements_gather_as_each_alone(topology, kind, monkeypatch):
@@ -128,18 +91,6 @@ def test_many_elements_gather_as_each_alone(topology, kind, monkeypatch):
         np.testing.assert_array_equal(ring.gather(topology, np.array(members)), alone)
 
 
-@by_name(WITH_SHEETS)
-def test_half_edges_around_each_corner_are_turns_apart(topology):
-    for half_edge in half_edges_of(topology):
-        ring = one_ring(signature_at(topology, half_edge, "face"))
-        local = ring.topology
-        for around, corner in zip(ring.around, range(local.face_sizes[0]), strict=True):
-            np.testing.assert_array_equal(local.turn[around[:-1]], around[1:])
-            assert corner in around
-            assert local.turn[around[-1]] in (-1, around[0])
-            assert len(around) == np.count_nonzero(local.face_vertices == local.face_vertices[corner])
-
-
 @pytest.mark.parametrize("sharpness", [9.99, 10.0, 20.0])
 def test_corners_of_sharpness_ten_are_not_semi_sharp(sharpness):
     """Beside a crease that is, in a face that does not see it."""
@@ -147,28 +98,6 @@ def test_corners_of_sharpness_ten_are_not_semi_sharp(sharpness):
     at_corner, at_crease = (signature_at(cage.cut_mesh.topology, 4 * face, "face") for face in (0, 13))
     assert at_crease.is_semi_sharp
     assert at_corner.is_semi_sharp == (sharpness < 10)
-
-
-@by_name(TOPOLOGIES)
-def test_signature_of_the_next_corner_is_rotated(topology):
-    for half_edge in half_edges_of(topology):
-        by_face = signature_at(topology, half_edge, "face")
-        assert by_face.rotated(0) == by_face
-        assert by_face.rotated(1) == signature_at(topology, int(topology.next[half_edge]), "face")
-        assert by_face.rotated(1).rotated(len(by_face.fans) - 1) == by_face
-        by_vertex = signature_at(topology, half_edge, "vertex")
-        assert by_vertex.rotated(1) == signature_at(topology, int(topology.turn[half_edge]), "vertex")
-
-
-@pytest.mark.parametrize(
-    ("cage", "places", "vertices"),
-    [(tetrahedron(), 4, 4), (cube(), 8, 8), (torus(3, 3), 16, 9), (torus(3, 5), 16, 12), (torus(4, 4), 16, 16)],
-)
-def test_small_cages_fill_places_more_than_once(cage, places, vertices):
-    ring = one_ring(signature_at(cage.topology, 0, "face"))
-    controls = ring.gather(cage.topology, cage.topology.face_offsets[:-1])
-    assert controls.shape == (cage.face_count, places)
-    assert all(len(set(row)) == vertices for row in controls)
 
 
 def test_faces_that_meet_at_a_vertex_of_valence_2_are_joined_along_both_edges():
@@ -192,13 +121,6 @@ def test_face_across_one_edge_is_one_face_whichever_way_it_is_reached():
     ring = one_ring(signature_at(topology, 0, "face"))
     # All but the bottom of the cube, each once.
     assert ring.topology.face_count == 7
-
-
-@pytest.mark.parametrize("n", [3, 4, 5])
-def test_pillow_has_only_its_own_vertices(n):
-    ring = one_ring(Signature("face", (Fan((n, n)),) * n))
-    assert ring.vertex_count == n
-    np.testing.assert_array_equal(ring.gather(PILLOWS[f"pillow {n}"], np.array([1]))[0], np.roll(range(n), -1))
 
 
 def test_a_face_is_named_by_the_first_walk_that_arrives_there():

@@ -1,21 +1,17 @@
-import math
 from decimal import Decimal
 
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.schemes import CatmullClark
-from mitsuba_subdivision.schemes.domain import IDENTITY
 from patches.closed_cages import CLOSED_CAGES, polygons
 from reference.exact_samples import mesh_of
-from reference.refined_cages import sheet
 from reference.rules import RULES
 
 pytestmark = pytest.mark.core
 
 # A stencil has some tens of weights, each with an error of half a unit in its last place.
 ROUNDING = 1e-14
-EVERY_CLOSED_CAGE = pytest.mark.parametrize("name", CLOSED_CAGES)
 SCHEME = CatmullClark()
 # A quad, a triangle and a pentagon around a corner, a fan of their own, and a vertex without a face.
 OPEN_FACES = [(0, 1, 2, 3), (2, 1, 4), (3, 2, 4, 5, 6), (7, 8, 9)]
@@ -58,33 +54,6 @@ def test_refinement_follows_the_rules(topology):
     np.testing.assert_allclose(refined[inner], expected, rtol=0, atol=ROUNDING)
 
 
-@EVERY_CLOSED_CAGE
-def test_refined_mesh_is_a_closed_manifold_of_quads_that_keeps_valences(name):
-    """Faces become vertices of their size."""
-    t = CLOSED_CAGES[name]().topology
-    refined = SCHEME.refine(t).topology
-    assert refined.vertex_count == t.vertex_count + t.edge_count + t.face_count
-    assert refined.face_count == t.half_edge_count
-    assert refined.edge_count == 2 * t.edge_count + t.half_edge_count
-    assert (refined.face_sizes == 4).all()
-    assert (refined.twin >= 0).all()
-    ends = refined.face_vertices[refined.next]
-    np.testing.assert_array_equal(refined.face_vertices[refined.twin], ends, "neighbours run opposite ways")
-    assert len(np.unique(refined.face_vertices * refined.vertex_count + ends)) == refined.half_edge_count
-    expected = [*t.vertex_face_count, *[4] * t.edge_count, *t.face_sizes]
-    np.testing.assert_array_equal(refined.vertex_face_count, expected)
-
-
-@EVERY_MESH
-def test_stencils_sum_to_one_and_are_affine_invariant(topology):
-    matrix = SCHEME.refine(topology).stencils.matrix
-    assert matrix.shape == (topology.vertex_count + topology.edge_count + topology.face_count, topology.vertex_count)
-    np.testing.assert_allclose(matrix.sum(axis=1), 1, rtol=0, atol=ROUNDING)
-    points, linear, offset = random_points(topology.vertex_count), random_points(3, seed=4), [10.0, -20.0, 30.0]
-    expected = matrix @ points @ linear + offset
-    np.testing.assert_allclose(matrix @ (points @ linear + offset), expected, rtol=0, atol=100 * ROUNDING)
-
-
 @EVERY_OPEN_MESH
 def test_border_vertices_move_along_the_border_only(topology):
     points = random_points(topology.vertex_count)
@@ -112,27 +81,6 @@ def test_regular_basis_has_the_shape_and_precision_of_its_arguments(dtype, deriv
     np.testing.assert_array_equal(basis, SCHEME.regular_basis(uv, 2)[: len(basis)])
 
 
-@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-14), (np.float32, 5e-6)])
-@pytest.mark.parametrize("a", range(4))
-@pytest.mark.parametrize("b", range(4))
-def test_regular_basis_reproduces_bicubics_and_their_derivatives(a, b, dtype, tolerance):
-    def monomial(u, power, order):
-        """Derivative of ``u ** power``."""
-        return math.perm(power, order) * u ** max(power - order, 0)
-
-    def control_values(places, power):
-        """Coefficients of ``t ** power`` in cubic B-splines whose control points sit at ``places`` (Marsden)."""
-        return [np.ones_like(places), places, places**2 - 1 / 3, places**3 - places][power]
-
-    u, v = uv = np.random.default_rng(6).random((2, 50))
-    i, j = SCHEME.regular_lattice.T
-    values = SCHEME.regular_basis(uv.T.astype(dtype), 2) @ (control_values(i, a) * control_values(j, b)).astype(dtype)
-    orders = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)]
-    expected = [monomial(u, a, m) * monomial(v, b, n) for m, n in orders]
-    # Control values reach 36; so does the rounding of their sum.
-    np.testing.assert_allclose(values, expected, rtol=0, atol=36 * tolerance)
-
-
 def test_regular_basis_is_exact_at_tiny_parameters():
     # The slope of the basis at the knot is exactly 0 and 1/2; weights near it must not lose the parameter.
     tiny, across = 2.0**-50, np.array([1, 4, 1, 0]) / 6
@@ -140,34 +88,3 @@ def test_regular_basis_is_exact_at_tiny_parameters():
     np.testing.assert_allclose(value[:, 3], across * tiny**3 / 6, rtol=1e-15)
     np.testing.assert_allclose(slope[:, 3], across * tiny**2 / 2, rtol=1e-15)
     np.testing.assert_allclose(slope[1, 1], -2 * tiny * 4 / 6, rtol=1e-15)
-
-
-@pytest.mark.parametrize("corner", range(4))
-def test_children_of_a_quad_lie_where_their_maps_say(corner):
-    cage = sheet(3, 3)
-    refinement = SCHEME.refine(cage.topology)
-    refined, place = refinement.topology, refinement.apply(cage.positions[:, :2] - 1)
-    # Of the face in the middle, whose first corner is at (0, 0).
-    parts = SCHEME.children(cage.topology, refined, 16 + corner)
-    assert [affine for affine, _ in parts] == list(SCHEME.domain.children)
-    for affine, half_edge in parts:
-        expected = SCHEME.domain.rotation(corner)(affine.inverse()(SCHEME.domain.corners))
-        # All faces are quads: a face's half-edges from this one on.
-        around = half_edge // 4 * 4 + (half_edge + np.arange(4)) % 4
-        np.testing.assert_array_equal(place[refined.face_vertices[around]], expected)
-
-
-@EVERY_CLOSED_CAGE
-def test_corner_of_another_polygon_becomes_one_quad(name):
-    topology = CLOSED_CAGES[name]().topology
-    refined = SCHEME.refine(topology).topology
-    for half_edge in np.flatnonzero(topology.face_sizes[topology.face] != 4):
-        ((affine, child),) = SCHEME.children(topology, refined, half_edge)
-        assert affine is IDENTITY
-        edges, faces = (
-            topology.vertex_count + topology.edge,
-            topology.vertex_count + topology.edge_count + topology.face,
-        )
-        corner, *others = polygons(refined)[refined.face[child]]
-        assert refined.face_vertices[child] == corner == topology.face_vertices[half_edge]
-        assert others == [edges[half_edge], faces[half_edge], edges[topology.prev[half_edge]]]

@@ -54,10 +54,7 @@ def test_tiny_parameters_keep_every_bit_in_the_child_at_the_corner(domain):
 
 
 @DOMAINS
-def test_maps_compose_and_inverses_are_exact(domain):
-    uv = inner_points(domain, 20)
-    for first, second in product(domain.children, repeat=2):
-        np.testing.assert_allclose((second @ first)(uv), second(first(uv)), rtol=0, atol=1e-15)
+def test_inverses_are_exact(domain):
     for affine in (IDENTITY, *domain.children, *rotations(domain)):
         assert same_map(affine @ affine.inverse(), IDENTITY)
         assert same_map(affine.inverse() @ affine, IDENTITY)
@@ -79,12 +76,6 @@ def test_rotation_moves_corners_on(domain):
         np.testing.assert_array_equal(rotation(domain.corners), np.roll(domain.corners, -corner, axis=0))
         assert np.linalg.det(rotation.matrix) == pytest.approx(1)
         assert same_map(rotation @ domain.rotation(1), domain.rotation((corner + 1) % domain.corner_count))
-
-
-@DOMAINS
-def test_child_0_holds_the_origin_and_others_follow_at_their_corners(domain):
-    for corner, child in zip(domain.corners, domain.children, strict=False):
-        np.testing.assert_array_equal(child(corner), corner)
 
 
 @DOMAINS
@@ -122,11 +113,3 @@ def test_extent_is_the_size_of_the_copy_that_reaches_the_parameters(domain, size
     assert (domain.inside(uv / (extent * (1 + 1e-12))[:, None]) > 0).all()
     assert (domain.inside(uv / (extent * (1 - 1e-12))[:, None]) < 0).all()
     assert domain.extent([0.0, 0.0]) == 0
-
-
-@DOMAINS
-def test_corners_of_the_first_copy_but_one_are_corners_of_other_copies(domain):
-    """So a self-similar element with regular other copies has one irregular corner at most."""
-    copies = [child.inverse()(domain.corners) for child in domain.children]
-    others = {tuple(corner) for copy in copies[1:] for corner in copy}
-    assert {tuple(corner) for corner in copies[0]} - others == {(0, 0)}
