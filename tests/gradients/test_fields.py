@@ -30,10 +30,10 @@ DISPLACED = 4e-2
 # the surface, and places at which texture coordinates fold.
 MOST_OTHERS = 0.08
 PLAIN, DISPLACING = ("control_points", "to_world", "cage_texcoords"), ("displacement_scale", "cage_height")
-# What moves at once: under one scheme each parameter alone, as compiling takes longest. Forward mode by attributes that
-# displace a surface ends in an error of Dr.Jit's under Doo-Sabin.
+# What moves at once, as compiling takes longest. Forward mode by attributes that displace a surface ends in an error of
+# Dr.Jit's under Doo-Sabin.
 BY = {
-    "catmull_clark": [(name,) for name in (*PLAIN, *DISPLACING)],
+    "catmull_clark": [PLAIN, DISPLACING],
     "loop": [PLAIN, DISPLACING],
     "doo_sabin": [PLAIN, DISPLACING[:1]],
 }

@@ -10,7 +10,6 @@ from gradients.surfaces import CLOSED, motions, moved
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.kernels import VertexKernel
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
-from mitsuba_subdivision.kernels.vertex_kernel import placed
 from mitsuba_subdivision.llvm import llvm_problem
 from reference.refined_cages import sheet, tagged
 
@@ -107,21 +106,6 @@ def test_gradients_of_triangles_converge_to_those_of_the_surface(surface, types)
     assert max(errors[-1]) <= FINEST
     assert ratios.min() >= QUARTER[0]
     assert ratios.max() <= QUARTER[1]
-
-
-def test_the_derivative_of_volume_by_the_placement_is_that_of_the_determinant(surface, types, np_rng):
-    table = surface.sampling(2)
-    matrix = np.eye(4) + np.vstack([np_rng.uniform(-0.2, 0.2, (3, 4)), np.zeros(4)])
-    to_world = sys.modules["drjit.llvm.ad"].Matrix4f64(matrix)
-    dr.enable_grad(to_world)
-    vertices = VertexKernel(table, types.float)(types.floats(surface.cage.positions.ravel()))
-    positions, _ = placed(*vertices, to_world, types.vector3)
-    volume = solids.of_triangles(types, positions, table.triangles)["volume"][0]
-    dr.backward(volume)
-    gradient, volume = np.array(dr.grad(to_world)).reshape(4, 4), np.array(volume).item()
-    expected = np.zeros((4, 4))
-    expected[:3, :3] = volume * np.linalg.inv(matrix[:3, :3]).T
-    assert np.abs(gradient - expected).max() <= ROUNDING * volume
 
 
 @pytest.mark.parametrize("triangles", [False, True])

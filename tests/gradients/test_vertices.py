@@ -73,6 +73,8 @@ def test_forward_reverse_and_differences_agree(name, tessellation, mirror, np_rn
     dr.set_grad(points, arrays.Float64(move.ravel()))
     dr.set_grad(matrix, arrays.Matrix4f64(turn))
     dr.forward_to(*(moving := vertices(points, matrix)))
+    for values, placed_on_host in zip(moving, on_host(table, positions, start), strict=True):
+        np.testing.assert_allclose(np.array(values), placed_on_host.ravel(), rtol=0, atol=100 * ROUNDING)
     forward = [np.array(dr.grad(array)).reshape(-1, 3) for array in moving]
     for derivative, difference in zip(forward, expected, strict=True):
         assert np.abs(derivative - difference).max() <= DIFFERENCES * np.abs(difference).max()

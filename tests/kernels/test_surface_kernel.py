@@ -163,7 +163,7 @@ def test_a_cage_refined_once_has_the_same_surface(monkeypatch, np_rng):
     np.testing.assert_allclose(vectors(found.n), expected.n, rtol=0, atol=BARS[DOUBLE]["normal"])
 
 
-@pytest.mark.parametrize("levels", range(PIECE_LEVELS))
+@pytest.mark.parametrize("levels", [0, PIECE_LEVELS - 1])
 @pytest.mark.parametrize("name", ["valence 50", "corner", "chaikin", "loop half disc of 6", "doo_sabin mixed torus"])
 def test_levels_of_tips_are_the_same_surface_as_pieces_and_as_sums(name, levels, np_rng):
     surface = surface_named(name)

@@ -1,4 +1,4 @@
-"""The kernel does what `VertexTable.apply` does, and its derivatives are those of that map."""
+"""The kernel does what `VertexTable.apply` does; its derivatives are tested in `gradients`."""
 
 import gc
 import weakref
@@ -6,7 +6,7 @@ import weakref
 import drjit as dr
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels import VertexKernel
@@ -15,12 +15,9 @@ from mitsuba_subdivision.kernels.vertex_kernel import UnitNormal
 from patches.closed_cages import bumpy, mixed_torus
 from reference.refined_cages import refine_first, tagged
 
-MIXED = [[0, 2, 3, 1], [4, 5, 7], [4, 7, 6], [3, 2, 6, 7], [0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4]]
 CREASED = tagged(named_cages.cube(), creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)])
 CASES = {
     "cube": lambda: LimitSurface(named_cages.cube()),
-    "valence 5": lambda: LimitSurface(named_cages.extraordinary(5, closed=False)),
-    "mixed": lambda: LimitSurface(ControlCage(named_cages.cube().positions, MIXED)),
     "large valence": lambda: LimitSurface(named_cages.extraordinary(12, closed=False)),
     # Regular patches only.
     "torus": lambda: LimitSurface(bumpy(named_cages.torus(5, 4))),
@@ -90,48 +87,16 @@ def launched(kernel, points):
 def test_classes_share_kernels_which_do_not_depend_on_where_arrays_lie(surface, float_type):
     """Dr.Jit takes NumPy's memory as it lies; else shapes of the same kind would be compiled again and again."""
     points = upload(float_type, surface.cage.positions)
-    found, kept = set(), []
+    compiled, kept = set(), []
     for count in range(5):
         # What lies between them moves the arrays of the next table.
         table = surface.sampling(4)
         kept.append([np.empty(40 * count, dtype=np.uint8), VertexKernel(table, float_type)])
-        found.add(launched(kept[-1][1], points))
-    (hashes,) = found
+        compiled.add(launched(kept[-1][1], points))
+    (hashes,) = compiled
     # One packs the control points; one each for vertices on planes and on polynomials of the scheme. Others refine
     # control points and weld copies of vertices, where there are any.
     assert len(hashes) == 1 + len(table.polynomials) + (table.refinement is not None) + bool(table.copies.size)
-
-
-@pytest.mark.core
-def test_derivatives_are_differences_and_the_same_both_ways_and_values_those_without(
-    surface, float_type, rounding, np_rng
-):
-    table = surface.sampling(3)
-    kernel, start = VertexKernel(table, float_type), surface.cage.positions
-    direction, step = np_rng.normal(size=start.shape), 1e-5
-    ahead, behind = (table.apply(start + side * step * direction) for side in (1, -1))
-    points = upload(float_type, start)
-    without = kernel(points)
-    dr.enable_grad(points)
-    dr.set_grad(points, upload(float_type, direction))
-    outputs = kernel(points)
-    dr.enqueue(dr.ADMode.Forward, points)
-    dr.traverse(dr.ADMode.Forward)
-    forward = [vectors(dr.grad(output)) for output in outputs]
-    for one, other in zip(without, outputs, strict=True):
-        np.testing.assert_allclose(np.array(one), np.array(dr.detach(other)), rtol=0, atol=rounding)
-    for derivative, a, b in zip(forward, ahead, behind, strict=True):
-        expected = (a - b) / (2 * step)
-        # Central differences in float64: truncation of order step**2, rounding of order 1e-16 / step.
-        np.testing.assert_allclose(derivative, expected, atol=1e-4 * np.abs(expected).max())
-
-    seeds = [np_rng.normal(size=f.shape) for f in forward]
-    points = upload(float_type, start)
-    dr.enable_grad(points)
-    dr.backward(sum(dr.dot(out, upload(float_type, seed)) for out, seed in zip(kernel(points), seeds, strict=True)))
-    products = np.concatenate([(f * s).ravel() for f, s in zip(forward, seeds, strict=True)])
-    off = np.array(dr.grad(points)) @ direction.ravel() - products.sum()
-    assert abs(off) < 20 * rounding * np.abs(products).sum()
 
 
 def test_collapsed_patches_have_zero_normals_and_finite_derivatives_and_missing_points_are_an_error(float_type):
@@ -152,8 +117,8 @@ def test_parallel_tangents_have_no_normal_and_no_derivatives(float_type, longer)
     vector3 = ArrayTypes(float_type).vector3
     du = vector3(1, 2, 4)
     normal = UnitNormal(du, longer * du, 0, du)
-    for found in (normal.value, normal.forward(vector3(1, 0, 0), vector3(0, 1, 0)), *normal.backward(du)):
-        np.testing.assert_array_equal(np.array(found), 0)
+    for vector in (normal.value, normal.forward(vector3(1, 0, 0), vector3(0, 1, 0)), *normal.backward(du)):
+        np.testing.assert_array_equal(np.array(vector), 0)
 
 
 def test_kernels_let_go_of_the_table(surface, float_type):
@@ -162,10 +127,10 @@ def test_kernels_let_go_of_the_table(surface, float_type):
     gc.freeze()
     table = surface.sampling(3)
     kept = [table, *table.polynomials, *(part.patch for part in table.polynomials)]
-    seen = [weakref.ref(found) for found in kept]
+    seen = [weakref.ref(value) for value in kept]
     kernel = VertexKernel(table, float_type)
     del table, kept
     gc.collect()
     gc.unfreeze()
-    assert [found() for found in seen] == [None] * len(seen)
+    assert [reference() for reference in seen] == [None] * len(seen)
     dr.eval(kernel(upload(float_type, surface.cage.positions)))
