@@ -11,8 +11,6 @@ from patches.closed_cages import SURFACES, cage_of
 RATES = range(1, 5)
 EVERY_SURFACE = pytest.mark.parametrize(("scheme", "name"), SURFACES)
 ROUNDING = 1e-13
-# At rate 1, faces on both sides of a vertex of valence 2 may have a triangle in common, which meets only itself.
-COLLAPSED = {("catmull_clark", "valence 2", 1), ("catmull_clark", "valence 2 beside triangle", 1)}
 
 
 def grid_of(scheme, name, rate):
@@ -21,25 +19,7 @@ def grid_of(scheme, name, rate):
 
 
 @EVERY_SURFACE
-def test_triangles_around_each_vertex_are_one_fan(scheme, name):
-    """So every edge has a triangle on either side, and they run along it opposite ways."""
-    for rate in (rate for rate in RATES if (scheme, name, rate) not in COLLAPSED):
-        fans = {}
-        for triangle in grid_of(scheme, name, rate).triangles().tolist():
-            assert len(set(triangle)) == 3
-            for i in range(3):
-                fan = fans.setdefault(triangle[i], {})
-                assert triangle[i - 2] not in fan
-                fan[triangle[i - 2]] = triangle[i - 1]
-        for fan in fans.values():
-            begin = current = next(iter(fan))
-            while fan:
-                current = fan.pop(current)
-            assert current == begin
-
-
-@EVERY_SURFACE
-def test_sizes_have_their_formulas_and_every_vertex_is_used_by_the_elements_around_it(scheme, name):
+def test_sizes_have_their_formulas_and_every_vertex_is_used(scheme, name):
     """From these it follows that the Euler characteristic is that of the cage."""
     for rate in RATES:
         grid = grid_of(scheme, name, rate)
@@ -61,19 +41,6 @@ def test_sizes_have_their_formulas_and_every_vertex_is_used_by_the_elements_arou
         np.testing.assert_array_equal(grid.element(), np.repeat(np.arange(t.face_count), triangles))
         assert len(grid.triangles()) == sum(triangles)
         assert grid.triangles().dtype == grid.element().dtype == np.uint32
-        # Elements meet in the vertices of their common edges only.
-        owners = [set() for _ in range(grid.vertex_count)]
-        for vertices, element in zip(grid.triangles().tolist(), grid.element().tolist(), strict=True):
-            for vertex in vertices:
-                owners[vertex].add(element)
-        for vertex, elements in enumerate(owners):
-            if vertex < t.vertex_count:
-                assert elements == set(t.face[t.face_vertices == vertex].tolist())
-            elif vertex < t.vertex_count + (rate - 1) * t.edge_count:
-                edge = (vertex - t.vertex_count) // (rate - 1)
-                assert elements == set(t.face[t.edge == edge].tolist())
-            else:
-                assert len(elements) == 1
 
 
 @pytest.mark.parametrize("domain", [SQUARE, TRIANGLE], ids=lambda domain: domain.name)
