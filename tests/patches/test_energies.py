@@ -19,9 +19,7 @@ BENDING = 1e-3
 STEP, VARIATION = 1e-4, 2e-6
 ORDER = 8
 SURFACES_OF_ALL_KINDS = {
-    "cube": lambda: LimitSurface(bumpy(named_cages.cube())),
     "polygons": lambda: LimitSurface(bumpy(mixed_torus(), size=0.05)),
-    "valence 7": lambda: LimitSurface(bumpy(named_cages.extraordinary(7, closed=False), size=0.02)),
     "Loop": lambda: LimitSurface(bumpy(cage_of("loop", "bipyramid")), "loop"),
     "Doo-Sabin": lambda: LimitSurface(bumpy(cage_of("doo_sabin", "prism")), "doo_sabin"),
     "creases": lambda: surface_of(SURFACES["piece, rings 10.0"]),

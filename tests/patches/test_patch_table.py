@@ -32,19 +32,8 @@ def turns(signature, corner_count):
 
 
 def assert_classes_differ(table):
-    every = [turns(each.signature, table.scheme.domain.corner_count) for each in table.classes]
+    every = [turns(group.signature, table.scheme.domain.corner_count) for group in table.classes]
     assert len(frozenset().union(*every)) == sum(map(len, every))
-
-
-@EVERY_SURFACE
-def test_every_whole_element_is_one_patch_and_every_corner_of_others(scheme, name):
-    table = patch_table(scheme, cage_of(scheme, name))
-    face = table.elements.face
-    corners = np.concatenate([patch_class.corners for patch_class in table.classes])
-    assert len(corners) == table.patch_count
-    whole = table.is_whole[face[corners]]
-    np.testing.assert_array_equal(np.sort(face[corners[whole]]), np.flatnonzero(table.is_whole))
-    np.testing.assert_array_equal(np.sort(corners[~whole]), np.flatnonzero(~table.is_whole[face]))
 
 
 @pytest.mark.parametrize(("scheme", "cage"), EVERY_CAGE.values(), ids=EVERY_CAGE)
@@ -85,19 +74,6 @@ def test_patches_of_a_class_see_the_same_near_faces_of_large_fans(scheme):
 
 
 @EVERY_SURFACE
-def test_the_patch_at_a_corner_leads_back_to_it(scheme, name):
-    table = patch_table(scheme, cage_of(scheme, name))
-    elements = table.elements
-    classes, patches, turns = table.patch_at(np.arange(elements.half_edge_count))
-    for corner in range(elements.half_edge_count):
-        found = table.classes[classes[corner]].corners[patches[corner]]
-        for _ in range(turns[corner]):
-            found = elements.next[found]
-        assert found == corner
-        assert 0 <= turns[corner] < (table.scheme.domain.corner_count if table.is_whole[elements.face[corner]] else 1)
-
-
-@EVERY_SURFACE
 def test_numbering_and_first_corners_do_not_matter_to_the_classes(scheme, name):
     cage = cage_of(scheme, name)
     rng = np.random.default_rng(8)
@@ -110,24 +86,6 @@ def test_numbering_and_first_corners_do_not_matter_to_the_classes(scheme, name):
     corner_count = tables[0].scheme.domain.corner_count
     one, other = ({turns(g.signature, corner_count): len(g.corners) for g in t.classes} for t in tables)
     assert one == other
-
-
-@pytest.mark.parametrize("name", CLOSED_CAGES)
-def test_elements_of_a_vertex_scheme_are_the_faces_around_each_vertex(name):
-    cage = CLOSED_CAGES[name]()
-    # Also of cages that the scheme takes no surface from.
-    table = PatchTable(cage.topology, scheme_named("doo_sabin"))
-    faces, elements = polygons(cage.topology), table.elements
-    assert elements.face_count == cage.vertex_count
-    assert (elements.twin >= 0).all()
-    for vertex, fan in enumerate(polygons(elements)):
-        assert sorted(fan) == [f for f, face in enumerate(faces) if vertex in face]
-        assert fan[0] == min(fan)
-        first, second, *_ = (faces[f] for f in fan)
-        # Counter-clockwise: the edge that comes to the vertex in one face leaves it in the next.
-        assert first[first.index(vertex) - 1] == second[(second.index(vertex) + 1) % len(second)] or len(fan) == 2
-    np.testing.assert_array_equal(table.topology.face_vertices[table.half_edge_of_corner], elements.face)
-    np.testing.assert_array_equal(elements.face_vertices[elements.twin], elements.face_vertices[elements.next])
 
 
 @pytest.mark.parametrize("scheme", ["catmull_clark", "doo_sabin", "loop"])
@@ -147,7 +105,7 @@ def test_cube_is_one_class_and_a_prism_has_one_for_each_kind_of_corner():
     assert sorted(len(patch_class.corners) for patch_class in table.classes) == [5] * 9
 
 
-@pytest.mark.parametrize("count", [1, 7, 500])
+@pytest.mark.parametrize("count", [0, 1, 7, 500])
 @pytest.mark.parametrize("widths", [(3,), (1, 1), (2, 5, 3), (1 << 40, 3, 1 << 20), (300, 1, 300, 300)])
 def test_codes_are_equal_and_ordered_as_rows_are(np_rng, widths, count):
     # Few distinct values over wide ranges: rows repeat, and ranges multiply beyond any integer.
@@ -163,7 +121,3 @@ def test_many_codes_of_many_rows_are_numbered_anew(np_rng):
     assert FEW_CODES < 890 * 200 < 4 * count
     rows = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)[1].ravel()
     np.testing.assert_array_equal(row_codes(columns), rows)
-
-
-def test_no_rows_have_no_codes():
-    assert row_codes([np.zeros(0, dtype=np.int64)] * 2).shape == (0,)

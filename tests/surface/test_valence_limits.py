@@ -9,7 +9,7 @@ from mitsuba_subdivision.schemes import CatmullClark, Loop
 from mitsuba_subdivision.surface import arguments
 
 SCHEMES = pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
-HIGH = 300
+HIGH = 200
 # Roundings of a circle's points, and of sums over them.
 ROUNDED = 1e-12
 # Roundings of eigenbases of fans, in points of size one and in unit normals: eigenvalues of fans are close.

@@ -98,34 +98,34 @@ def test_the_shape_says_so_too(leave):
         mi.load_dict(shape)
 
 
-LIMITED = """
-import sys, resource
+LIMITED = f"""
+import re, resource
 import mitsuba_subdivision as msub
 from mitsuba_subdivision.cage import named_cages
-surface, rate = msub.LimitSurface(named_cages.cube()), int(sys.argv[1])
+surface = msub.LimitSurface(named_cages.cube())
 surface.tessellate(8)
 used = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
-resource.setrlimit(resource.RLIMIT_AS, (used + int(sys.argv[2]), resource.RLIM_INFINITY))
+resource.setrlimit(resource.RLIMIT_AS, (used + {200 * MEGABYTE}, resource.RLIM_INFINITY))
 try:
-    print(len(surface.tessellate(rate).positions))
+    surface.tessellate(5000)
 except MemoryError as error:
     print(error)
+    fits = int(re.search(r"at most (\\d+)$", str(error))[1])
+# It is an estimate: allocators keep more than they are asked for.
+resource.setrlimit(resource.RLIMIT_AS, (used + {300 * MEGABYTE}, resource.RLIM_INFINITY))
+print(len(surface.tessellate(fits).positions))
 """
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits of the process are read from /proc")
 def test_a_cube_at_5000_is_an_error_and_no_more_than_the_estimate_is_needed():
-    def run(rate, limit):
-        command = [sys.executable, "-c", LIMITED, str(rate), str(limit)]
-        # Threads of other libraries would reserve memory of their own.
-        settings = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-        return subprocess.check_output(command, text=True, timeout=120, env=settings).strip()
-
-    said = run(5000, 200 * MEGABYTE)
-    fits = int(re.fullmatch(r"tessellation rate 5000 needs about 32.7 GB, .* expected at most (\d+)", said)[1])
+    # Threads of other libraries would reserve memory of their own.
+    settings = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
+    printed = subprocess.check_output([sys.executable, "-c", LIMITED], text=True, timeout=120, env=settings)
+    message, count = printed.strip().splitlines()
+    fits = int(re.fullmatch(r"tessellation rate 5000 needs about 32.7 GB, .* expected at most (\d+)", message)[1])
     assert 300 < fits < 500
-    # It is an estimate: allocators keep more than they are asked for.
-    assert int(run(fits, 300 * MEGABYTE)) == 6 * fits**2 + 2
+    assert int(count) == 6 * fits**2 + 2
 
 
 # Rates of an adaptive grid have 16 bits.
