@@ -7,7 +7,7 @@ from kernels.surfaces import SURFACES, random_locations, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
 from mitsuba_subdivision.patches import patch_samples
-from mitsuba_subdivision.tessellation import Criterion, Measure
+from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
 from patches.closed_cages import bumpy
 from reference.refined_cages import refine_first
 

@@ -113,14 +113,15 @@ def test_attributes_are_exact_on_both_sides_of_seams(scheme, cage, np_rng):
     surface = LimitSurface(with_seams(bumpy(cage), np_rng), scheme)
     table = table_of(surface, 5e-3)
     attributes = surface.attribute_table(table)
-    assert attributes.surface_vertex is not None
-    np.testing.assert_array_equal(attributes.surface_vertex[attributes.triangles], table.triangles)
+    layout = attributes.layout
+    assert layout.surface_vertex is not None
+    np.testing.assert_array_equal(layout.surface_vertex[layout.triangles], table.triangles)
     corner, uv = table.grid.triangle_locations
     element = table.element.repeat(3)
     places = element, uv.reshape(-1, 2), corner.repeat(3) - surface.patches.elements.face_offsets[element]
     for name, values in attributes.values.items():
         expected = surface.evaluate_attribute(name, *places)
-        np.testing.assert_allclose(values[attributes.triangles.ravel()], expected, rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(values[layout.triangles.ravel()], expected, rtol=0, atol=ROUNDING)
 
 
 def with_a_diagonal_twice():
