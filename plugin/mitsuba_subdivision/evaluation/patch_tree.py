@@ -32,8 +32,8 @@ from .refined_rings import refined_children
 
 # Number of control points of the one-rings that are refined together, which bounds memory to tens of megabytes.
 JOINED_CONTROLS = 1 << 14
-# Maximum depth of a patch tree. Each refinement reduces the sharpness of semi-sharp features, which is below `INFINITE`,
-# by one. Without them, the schemes of this package need one or two refinements until all elements are pieces. A scheme
+# Maximum depth of a patch tree. Each refinement reduces the sharpness of semi-sharp features, below `INFINITE`, by one.
+# Without them, the schemes of this package need one or two refinements until all elements are pieces. A scheme
 # that needs more than six is refused: its rules keep making new extraordinary points.
 MOST_DEPTH = int(INFINITE) + 7
 
