@@ -257,10 +257,10 @@ class CoefficientMap:
         # Parts of patches have control points of their own, stored after all others, and so are their indices.
         point_count, packets_of_piece = self._refined_count, table.packets_of_piece
         parts, pieces, rings = [], [], []
-        for maps, (first, count, control_count, first_piece, piece_count, first_ring, is_ring) in zip(
-            table.maps, table.classes.tolist(), strict=True
+        for tree, (first, count, control_count, first_piece, piece_count, first_ring, is_ring) in zip(
+            table.trees, table.classes.tolist(), strict=True
         ):
-            for begin, stencils, weights in maps:
+            for begin, stencils, weights in tree.maps:
                 part_first, part_size = first, control_count
                 if stencils is not None:
                     part_first, part_size = len(controls) + point_count - self._refined_count, len(stencils)

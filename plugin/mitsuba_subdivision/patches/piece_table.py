@@ -10,7 +10,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from ..evaluation.patch_tree import PartKind, patch_trees
 from ..evaluation.polynomials import polynomial_basis
-from ..evaluation.tree_arrays import LEVEL_PIECES, PIECE_LEVELS, PieceMap, TreeArrays, tree_arrays
+from ..evaluation.tree_arrays import LEVEL_PIECES, PIECE_LEVELS, TreeArrays, tree_arrays
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared
@@ -52,6 +52,8 @@ class PieceTable:
     patches: PatchTable
     control_count: int
     piece_levels: int  # Number of levels of tips that are stored as pieces
+    packets_of_piece: int  # Packets of the coefficients of a piece
+    packet_count: int  # Packets of all coefficients
     patch_starts: NDArray[np.uint32]  # (p, 2) uint32: first piece and first node of each patch
     # (p,) uint32: first packet of the control points of each patch; any number for patches without tips
     rings: NDArray[np.uint32]
@@ -87,64 +89,47 @@ class PieceTable:
     ) -> PieceTable:
         refined = patches.refined
         table = patches if refined is None else refined.table
-        counts = np.array([len(patch_class.corners) for patch_class in table.classes])
-        control_counts = table.control_counts.tolist()
+        counts, control_counts = np.array([len(kind.corners) for kind in table.classes]), table.control_counts
         # Building all trees in one call shares most of their data.
-        elements = patch_trees(table.scheme, [patch_class.signature for patch_class in table.classes])
+        elements = patch_trees(table.scheme, [kind.signature for kind in table.classes])
         packets_of_piece = piece_packets(len(polynomial_basis(table.scheme).powers))
-        tip_counts = np.array([element.tip_count for element in elements])
-        bytes_of_level = 4 * PACKET * packets_of_piece * LEVEL_PIECES * int((tip_counts * counts).sum())
+        tip_count = int(np.array([element.tip_count for element in elements]) @ counts)
+        bytes_of_level = 4 * PACKET * packets_of_piece * LEVEL_PIECES * tip_count
         if bytes_of_level:
             piece_levels = min(piece_levels, COEFFICIENT_BYTES // bytes_of_level)
-        signatures = counted([patch_class.signature for patch_class in table.classes], "Pieces of patch classes")
-        trees = [tree_arrays(table.scheme, signature, piece_levels) for signature in signatures]
-        has_ring = np.array([len(tree.blocks) > 0 for tree in trees])
-        rings = has_ring * np.array(control_counts)
+        signatures = counted([kind.signature for kind in table.classes], "Pieces of patch classes")
+        trees = tuple(tree_arrays(table.scheme, signature, piece_levels) for signature in signatures)
         sizes = np.array([tree.piece_count for tree in trees])
-        controls, refinement = patches.control_rows(control_of_vertex, control_count)
-        first_pieces = ragged.starts(sizes * counts)
+        rings = np.where([len(tree.blocks) > 0 for tree in trees], control_counts, 0)
+        first_pieces, piece_count = ragged.starts(sizes * counts), int(sizes @ counts)
+        first_rings = packets_of_piece * piece_count + ragged.starts(rings * counts)
+        packet_count = packets_of_piece * piece_count + int(rings @ counts)
+        first_controls = [kind.first_control for kind in table.classes]
+        columns = first_controls, counts, control_counts, first_pieces, sizes, first_rings, rings
         first_nodes = ragged.starts(np.array([len(tree.kinds) for tree in trees]))
-        first_rings = packets_of_piece * int((sizes * counts).sum()) + ragged.starts(rings * counts)
-        classes = [
-            (patch_class.first_control, *patch_class.controls.shape, *columns)
-            for patch_class, *columns in zip(table.classes, first_pieces, sizes, first_rings, rings, strict=True)
-        ]
-        starts = [
-            np.stack([piece + size * np.arange(count), np.full(count, node)], axis=1)
-            for piece, size, count, node in zip(first_pieces, sizes, counts, first_nodes, strict=True)
-        ]
-        rings_of_patches = [
-            first + ring * np.arange(count) for first, ring, count in zip(first_rings, rings, counts, strict=True)
-        ]
+        in_class = ragged.index_in_row(counts)
+        starts = np.repeat(first_pieces, counts) + np.repeat(sizes, counts) * in_class, np.repeat(first_nodes, counts)
         return cls(
             patches,
             control_count,
             piece_levels,
-            np.concatenate(starts).astype(np.uint32),
-            np.concatenate(rings_of_patches).astype(np.uint32),
-            _joined_nodes(trees, control_counts),
-            tuple(trees),
-            np.array(classes, dtype=np.uint32),
-            controls,
-            refinement,
+            packets_of_piece,
+            packet_count + -packet_count % packets_of_piece,
+            np.stack(starts, axis=1).astype(np.uint32),
+            (np.repeat(first_rings, counts) + np.repeat(rings, counts) * in_class).astype(np.uint32),
+            _joined_nodes(trees, control_counts.tolist()),
+            trees,
+            np.stack(columns, axis=1).astype(np.uint32),
+            *patches.control_rows(control_of_vertex, control_count),
         )
-
-    @property
-    def maps(self) -> list[tuple[PieceMap, ...]]:
-        """`TreeArrays.maps` of each class."""
-        return [tree.maps for tree in self.trees]
 
     def weights(self, size: int, dtype: DTypeLike = np.float64) -> FloatArray:
         """``(w, size)`` blocks of all classes, one row for each control point, padded with zeros.
 
         Computed at each call, as kernels keep the result.
         """
-        weights = np.zeros((sum(tree.blocks.shape[0] * tree.blocks.shape[1] for tree in self.trees), size), dtype)
-        end = 0
-        for rows in (tree.blocks.reshape(-1, tree.blocks.shape[2]) for tree in self.trees):
-            begin, end = end, end + len(rows)
-            weights[begin:end, : rows.shape[1]] = rows
-        return weights
+        rows = np.concatenate([tree.blocks.reshape(-1, tree.blocks.shape[2]) for tree in self.trees], dtype=dtype)
+        return np.pad(rows, ((0, 0), (0, size - rows.shape[1])))
 
     @property
     def half_edges(self) -> NDArray[np.uint32]:
@@ -172,19 +157,6 @@ class PieceTable:
         columns[:, CODE] = PATCH * patch + WHOLE * is_whole + PATCH_CORNER * patch_corner + corner
         return columns
 
-    @property
-    def packets_of_piece(self) -> int:
-        """Packets of the coefficients of a piece."""
-        return piece_packets(len(polynomial_basis(self.patches.scheme).powers))
-
-    @property
-    def packet_count(self) -> int:
-        """Packets of all coefficients, padded to whole pieces."""
-        _, patches, _, _, pieces, _, rings = self.classes.astype(np.int64).T
-        of_piece = self.packets_of_piece
-        count = int((patches * (of_piece * pieces + rings)).sum())
-        return count + -count % of_piece
-
 
 _TABLES: Shared[PieceTable] = Shared()
 
@@ -194,7 +166,7 @@ def piece_packets(monomial_count: int) -> int:
     return -(-3 * monomial_count // PACKET)
 
 
-def _joined_nodes(trees: list[TreeArrays], control_counts: list[int]) -> NDArray[np.uint32]:
+def _joined_nodes(trees: tuple[TreeArrays, ...], control_counts: list[int]) -> NDArray[np.uint32]:
     """`PieceTable.nodes`."""
     nodes, first_node, first_row = [], 0, 0
     for tree, control_count in zip(trees, control_counts, strict=True):
