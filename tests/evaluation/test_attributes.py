@@ -192,7 +192,7 @@ def test_without_seams_values_are_subdivided_as_points_are(scheme, cage, mode, n
     expected = surface.evaluate(*places).p
     for name in attributes:
         np.testing.assert_array_equal(surface.evaluate_attribute(name, *places), expected)
-        assert surface.channel(name).patches is surface.patches
+        assert surface.channel(name).layout.patches is surface.patches
 
 
 @pytest.mark.parametrize("triangles", [False, True])
@@ -251,7 +251,7 @@ def test_sharpness_of_seams_does_not_act(mode, method, np_rng):
     t = cage.topology
     smooth = textured(cage, random_indices(cage, np_rng, "islands"), np_rng, face_varying=mode)
     plain = LimitSurface(smooth)
-    on_seams = np.flatnonzero(plain.channel("texcoords").seam & (t.twin > np.arange(t.half_edge_count)))
+    on_seams = np.flatnonzero(plain.channel("texcoords").layout.seam & (t.twin > np.arange(t.half_edge_count)))
     options = {"creases": creases_along(cage, on_seams, np_rng, [0.5, 1.75]), "crease_method": method}
     sharp = LimitSurface(tagged(cage, texcoords=smooth.texcoords, face_varying=mode, **options))
     places = random_locations(plain, np_rng)

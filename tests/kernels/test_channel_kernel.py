@@ -86,7 +86,7 @@ def test_values_by_linear_rules_are_the_channels(surface, np_rng):
     surface = LimitSurface(tagged(surface.cage, attributes=attributes, face_varying="all"), surface.scheme.name)
     locations = random_locations(surface, np_rng, 600)
     for name in ("varying 1", "seams 2"):
-        assert surface.channel(name).is_linear
+        assert surface.channel(name).layout.is_linear
         found, *_ = evaluated(surface, name, DOUBLE, *locations)
         np.testing.assert_allclose(found, surface.evaluate_attribute(name, *locations), rtol=0, atol=ROUNDING[DOUBLE])
 

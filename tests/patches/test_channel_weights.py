@@ -72,8 +72,8 @@ def test_values_of_faces_cut_from_each_other_are_linear(name, mode, np_rng, monk
     surface = LimitSurface(cage, "loop" if name == "triangles" else None)
     start, uv = grid_locations(surface, 4)
     direct = surface.channel("islands")
-    assert direct.is_linear
-    assert not surface.channel("seam").is_linear
+    assert direct.layout.is_linear
+    assert not surface.channel("seam").layout.is_linear
     monkeypatch.setattr(channel, "_is_cut_into_faces", lambda *_: False)
     layout = channel._layout_of("islands", cage.attributes["islands"], cage, surface.scheme, surface.patches)
     assert not layout.is_linear
@@ -87,4 +87,4 @@ def test_values_of_faces_cut_from_each_other_are_subdivided_where_that_is_not_li
         with_attributes(named_cages.cube(), np_rng, face_varying="none"),
         with_attributes(mixed_torus(), np_rng),
     ):
-        assert not LimitSurface(cage).channel("islands").is_linear
+        assert not LimitSurface(cage).channel("islands").layout.is_linear

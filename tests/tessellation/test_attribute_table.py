@@ -94,7 +94,7 @@ def test_vertices_are_split_where_seams_or_creases_are_only(scheme, cage, np_rng
     surface = LimitSurface(cage, scheme)
     found = surface.tessellate(3)
     t = cage.topology
-    seam = surface.channel("texcoords").seam | surface.channel("other_seams").seam
+    seam = surface.channel("texcoords").layout.seam | surface.channel("other_seams").layout.seam
     cut = ((seam | cage.tags.is_infinite) & (t.twin >= 0)).sum() + (t.twin < 0).sum()
     edges = np.concatenate([found.triangles[:, [i, i - 1]] for i in range(3)])
     counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)[1]

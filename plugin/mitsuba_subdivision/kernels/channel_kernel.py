@@ -29,12 +29,12 @@ class ChannelKernel:
         types, size = ArrayTypes(float_type), channel.values.shape[1]
         self._pieces: PieceKernel | None = None
         linear_map: SparseMatrix | CoefficientMap
-        if channel.is_linear:
+        if channel.layout.is_linear:
             # A polynomial for each half-edge
-            self._monomials = Monomials(_POWERS[: channel.patches.scheme.domain.corner_count])
+            self._monomials = Monomials(_POWERS[: channel.layout.patches.scheme.domain.corner_count])
             linear_map = SparseMatrix(channel.linear_polynomials, float_type, is_relative=False)
         else:
-            table = PieceTable.build(channel.patches, channel.value_index, len(channel.values))
+            table = PieceTable.build(channel.layout.patches, channel.layout.value_index, len(channel.values))
             self._pieces, linear_map = PieceKernel.shared(table, float_type), CoefficientMap.shared(table, float_type)
         self._types, self.values = types, ControlValues(types, size, linear_map).load(channel.values)
 

@@ -69,42 +69,22 @@ class Channel:
     layout: ChannelLayout
     values: FloatArray  # (n, k) float64
 
-    @property
-    def patches(self) -> PatchTable:
-        """See `ChannelLayout`."""
-        return self.layout.patches
-
-    @property
-    def value_index(self) -> IntArray:
-        """See `ChannelLayout`."""
-        return self.layout.value_index
-
-    @property
-    def seam(self) -> NDArray[np.bool_] | None:
-        """See `ChannelLayout`."""
-        return self.layout.seam
-
-    @property
-    def is_linear(self) -> bool:
-        """See `ChannelLayout`."""
-        return self.layout.is_linear
-
     def evaluate(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
         """``(s, k)`` values at samples."""
         return self.with_derivatives(half_edge, uv)[0]
 
     def with_derivatives(self, half_edge: IntArray, uv: FloatArray) -> FloatArray:
         """``(3, s, k)`` values and derivatives by u and v; at extraordinary points tangents, see `SurfaceSamples`."""
-        if self.is_linear:
+        if self.layout.is_linear:
             rows, weights = self._linear_terms(half_edge, uv)
             return np.stack([(w[:, :, None] * self._values_and_centres[rows]).sum(axis=1) for w in weights])
         return np.stack(self._sampler.evaluate(half_edge, uv)[:3])
 
     def weights(self, half_edge: IntArray, uv: FloatArray) -> sparse.csr_array:
         """``(s, n)`` weights of the values at samples; rows sum to one."""
-        if not self.is_linear:
-            indices = self.value_index, len(self.values)
-            return stencil_matrices(self.patches, *indices, half_edge, uv, limit_stencils, 1)[0]
+        if not self.layout.is_linear:
+            indices = self.layout.value_index, len(self.values)
+            return stencil_matrices(self.layout.patches, *indices, half_edge, uv, limit_stencils, 1)[0]
         from scipy import sparse
 
         rows, (weights, *_) = self._linear_terms(half_edge, uv)
@@ -114,7 +94,7 @@ class Channel:
 
     @cached_property
     def _sampler(self) -> PatchSampler:
-        return PatchSampler(self.patches, self.values, self.value_index)
+        return PatchSampler(self.layout.patches, self.values, self.layout.value_index)
 
     @cached_property
     def _values_and_centres(self) -> FloatArray:
@@ -125,10 +105,10 @@ class Channel:
         """``(n + n_f, n)`` matrix from linear values to the values followed by their means over each face."""
         from scipy import sparse
 
-        t, count = self.patches.topology, len(self.values)
+        t, count = self.layout.patches.topology, len(self.values)
         entries = np.concatenate([np.ones(count), 1 / t.face_sizes[t.face]])
         rows = np.concatenate([np.arange(count), count + t.face])
-        columns = np.concatenate([np.arange(count), self.value_index])
+        columns = np.concatenate([np.arange(count), self.layout.value_index])
         return sparse.csr_array((entries, (rows, columns)), shape=(count + t.face_count, count))
 
     @property
@@ -136,12 +116,12 @@ class Channel:
         """Matrix from linear values to coefficients of 1, u, v and, on the square, u v, for each half-edge."""
         from scipy import sparse
 
-        half_edges = np.arange(len(self.patches.half_edge_of_corner))
+        half_edges = np.arange(len(self.layout.patches.half_edge_of_corner))
         at_start, at_end = (
             self._linear_terms(half_edges, np.tile(uv, (len(half_edges), 1))) for uv in ((0.0, 0.0), (0.0, 1.0))
         )
         (rows, coefficients), (_, (_, by_u, _)) = at_start, at_end
-        if self.patches.scheme.domain.corner_count == 4:
+        if self.layout.patches.scheme.domain.corner_count == 4:
             coefficients = np.concatenate([coefficients, [by_u - coefficients[1]]])
         weights, centres = coefficients.swapaxes(0, 1), self.with_centres
         columns = np.broadcast_to(rows[:, None], weights.shape)
@@ -151,11 +131,11 @@ class Channel:
 
     def _linear_terms(self, half_edge: IntArray, uv: FloatArray) -> tuple[IntArray, FloatArray]:
         """Rows ``(s, m)`` of `with_centres`, and their weights ``(3, s, m)`` in values and derivatives by u and v."""
-        t, domain = self.patches.topology, self.patches.scheme.domain
-        corners = [self.patches.half_edge_of_corner[half_edge]]
+        t, domain = self.layout.patches.topology, self.layout.patches.scheme.domain
+        corners = [self.layout.patches.half_edge_of_corner[half_edge]]
         for _ in range(domain.corner_count - 2):
             corners.append(t.next[corners[-1]])
-        rows = self.value_index[np.stack([*corners, t.prev[corners[0]]], axis=1)]
+        rows = self.layout.value_index[np.stack([*corners, t.prev[corners[0]]], axis=1)]
         weights = np.array([domain.corner_weights(*uv.T), *domain.corner_derivatives(*uv.T)]).swapaxes(1, 2)
         face = t.face[corners[0]]
         is_partial = t.face_sizes[face] != domain.corner_count
@@ -178,11 +158,11 @@ def contracts_alike(
 
     If so, tangents of the values and of the points are the same multiples of derivatives nearby.
     """
-    if channel.is_linear:
+    if channel.layout.is_linear:
         return np.zeros(len(half_edge), dtype=bool)
-    if channel.patches is patches:
+    if channel.layout.patches is patches:
         return np.ones(len(half_edge), dtype=bool)
-    tables = channel.patches, patches
+    tables = channel.layout.patches, patches
     # For values and for points, rows of the patch class and of the corner of the patch, which determine the fan.
     places = np.array([column for table in tables for column in table.patch_at(half_edge)[::2]])
     distinct, place_index = np.unique(places, axis=1, return_inverse=True)

@@ -166,7 +166,7 @@ class CageAttributes:
 
     def _weights_of(self, channel: Channel) -> Any:
         # Attributes that share control vertices and patches share weights.
-        key = type(channel), id(channel.patches), channel.value_index.tobytes()
+        key = type(channel), id(channel.layout.patches), channel.layout.value_index.tobytes()
         if key not in self._weights:
             weights: Any = channel.weights(*self._locations())
             if self._float is not None:

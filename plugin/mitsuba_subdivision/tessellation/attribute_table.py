@@ -98,7 +98,7 @@ def _layout(
     def on_surface(channel: Channel) -> FloatArray:
         # Without seams, and subdivided on the surface's mesh.
         control_values = np.zeros((table.control_count, channel.values.shape[1]))
-        control_values[control_of_vertex] = channel.values[channel.value_index]
+        control_values[control_of_vertex] = channel.values[channel.layout.value_index]
         vertex_values = table.interpolated(control_values)
         vertex_values[table.copies[0]] = vertex_values[table.copies[1]]
         return vertex_values if surface_vertex is None else vertex_values[surface_vertex]
@@ -110,7 +110,7 @@ def _layout(
             return lambda channel: channel.evaluate(*locate())
         channel_table = uniform_table(layout.patches, table.grid.rate)
         vertices = grid.vertices_of(channel_table.grid)
-        return lambda channel: channel_table.interpolated(channel.values[channel.value_index])[vertices]
+        return lambda channel: channel_table.interpolated(channel.values[channel.layout.value_index])[vertices]
 
     evaluations = tuple(map(evaluate, layouts))
     if not seams:
