@@ -61,7 +61,7 @@ class BernsteinBasis:
         # A multinomial coefficient over the triangle, a product of two binomial coefficients over the square.
         values = factorials[-1] ** (self.domain.corner_count - 2) / factorials[self._exponents].prod(axis=1)
         for distance, exponent in zip(self.domain.edge_distances(*uv.T), self._exponents.T, strict=True):
-            values = values * distance[:, None] ** exponent
+            values = values * np.vander(distance, self.degree + 1, increasing=True)[:, exponent]
         return values
 
     @cached_property
@@ -89,12 +89,11 @@ class BernsteinBasis:
     @cached_property
     def derivatives(self) -> FloatArray:
         """``(2, b, b)`` maps from coefficients to those of the derivatives by u and by v, in the same basis."""
-        powers = self.indices
-        lowered = [
-            (powers[:, None] + step == powers).all(axis=2) * powers[:, axis] for axis, step in enumerate(np.eye(2))
-        ]
+        # Values and derivatives of the monomials at the sites.
+        values, *slopes = monomial_values(self.indices, self._sites).swapaxes(1, 2)
+        of_monomials = np.linalg.solve(values, self.values(self._sites))
         # All entries are integers: differences of neighbours, degree-elevated by one.
-        return np.rint(np.linalg.solve(self.monomials, np.stack(lowered) @ self.monomials))
+        return np.rint(self._from_values @ np.stack(slopes) @ of_monomials)
 
     @cached_property
     def two_derivatives(self) -> FloatArray:
@@ -103,9 +102,9 @@ class BernsteinBasis:
         return np.stack([u, v, u @ u, u @ v, v @ v])
 
     @cached_property
-    def monomials(self) -> FloatArray:
-        """``(b, b)`` map from Bernstein coefficients to those of ``u^i v^j``, in the order of `indices`."""
-        return np.linalg.solve((self._sites[:, None, :] ** self.indices).prod(axis=2), self.values(self._sites))
+    def jets(self) -> FloatArray:
+        """``(b, 6 b)`` map from values of the basis functions to their values and `two_derivatives`, side by side."""
+        return np.concatenate([np.eye(len(self.indices)), *self.two_derivatives], axis=1)
 
     @cached_property
     def sides(self) -> list[IntArray]:

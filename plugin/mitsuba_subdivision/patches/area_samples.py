@@ -175,19 +175,13 @@ def _uniform_in_pieces(pieces: PolynomialPieces, which: IntArray, rng: np.random
     accepted_uv, left = np.empty((len(which), 2)), np.arange(len(which))
     while len(left):
         uv = pieces.basis.domain.from_square(rng.random((len(left), 2)))
-        piece = which[left]
-        is_accepted = rng.random(len(left)) * bound[piece] < _area_elements_at(pieces, piece, uv)
+        piece, values = which[left], pieces.basis.values(uv)
+        rows = np.stack([values @ derivative for derivative in pieces.basis.derivatives], axis=1)
+        du, dv = (rows @ pieces.coefficients[piece]).swapaxes(0, 1)
+        is_accepted = rng.random(len(left)) * bound[piece] < np.linalg.norm(np.cross(du, dv), axis=1)
         accepted_uv[left[is_accepted]] = uv[is_accepted]
         left = left[~is_accepted]
     return accepted_uv
-
-
-def _area_elements_at(pieces: PolynomialPieces, piece: IntArray, uv: FloatArray) -> FloatArray:
-    """``(s,)`` area elements at parameters ``uv`` of pieces ``which``."""
-    values = pieces.basis.values(uv)
-    rows = np.stack([values @ derivative for derivative in pieces.basis.derivatives], axis=1)
-    du, dv = (rows @ pieces.coefficients[piece]).swapaxes(0, 1)
-    return np.linalg.norm(np.cross(du, dv), axis=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from ..evaluation.irregular_patch import level_at_size
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .nearest_in_piece import ROUNDED, TurnedBoxes, nearest_in_pieces, slopes
-from .polynomial_pieces import PolynomialPieces, SurfacePieces, Tips
+from .polynomial_pieces import Parts, PolynomialPieces, SurfacePieces, Tips
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -33,8 +33,6 @@ FLAT_SLOPE = 1e-10
 SMALLEST = 2.0**-44
 # Points per run of a query, which bounds temporary memory to some hundred megabytes.
 CHUNK = 1 << 17
-
-_Parts = TypeVar("_Parts", PolynomialPieces, Tips)
 
 # Children of a node of `BoxTree`.
 WIDTH = 8
@@ -177,17 +175,17 @@ class _Best:
             left = ~is_convex & (squared_distance <= self.reach[point])
             if not left.any():
                 return
-            used, used_index = _numbered(piece[left], len(pieces))
+            used, used_index = np.unique(piece[left], return_inverse=True)
             pieces, boxes = pieces.chosen(used).halved(), None
             point, piece = np.tile(point[left], 4), (used_index + len(used) * np.arange(4)[:, None]).ravel()
 
     def _near(
-        self, point: IntArray, parts: _Parts, part: IntArray, lower: FloatArray, upper: FloatArray
-    ) -> tuple[IntArray, _Parts, IntArray]:
+        self, point: IntArray, parts: Parts, part: IntArray, lower: FloatArray, upper: FloatArray
+    ) -> tuple[IntArray, Parts, IntArray]:
         """Pairs of a point and a part whose box is within reach: points, the parts in use, and indices into these."""
         gaps = squared_gaps(self._points.take(point, axis=0), lower.take(part, axis=0), upper.take(part, axis=0))
         is_near = gaps <= self.reach.take(point)
-        used, used_index = _numbered(part[is_near], len(parts))
+        used, used_index = np.unique(part[is_near], return_inverse=True)
         return point[is_near], parts.chosen(used), used_index
 
     def _are_minima(self, point: IntArray, pieces: PolynomialPieces, piece: IntArray) -> NDArray[np.bool_]:
@@ -207,7 +205,7 @@ class _Best:
         squared = np.einsum("nx,nx->n", difference, difference)
         slope = slopes(tips.tangents[tip], difference)
         self._take(point, squared, slope, tips.half_edge[tip], tips.offsets[tip])
-        used, tip = _numbered(tip, len(tips))
+        used, tip = np.unique(tip, return_inverse=True)
         tips = tips.chosen(used)
         for level in range(first_level, level_at_size(tips.patch, SMALLEST)):
             reach = tips.reach(level)
@@ -239,16 +237,6 @@ class _Best:
         updated = point[candidates]
         self._squared_distance[updated], self._slope[updated] = squared[candidates], slope[candidates]
         self.half_edge[updated], self.uv[updated] = half_edge[candidates], uv[candidates]
-
-
-def _numbered(which: IntArray, count: int) -> tuple[IntArray, IntArray]:
-    """`numpy.unique` with `return_inverse`, of indices below ``count``, in linear time."""
-    is_used = np.zeros(count, dtype=bool)
-    is_used[which] = True
-    used = np.flatnonzero(is_used)
-    position = np.empty(count, dtype=np.int64)
-    position[used] = np.arange(len(used))
-    return used, position[which]
 
 
 def _first_levels(pieces: SurfacePieces) -> list[int]:
@@ -299,31 +287,27 @@ class BoxTree:
         squared_distance: FloatArray,  # (s,) float64
     ) -> tuple[IntArray, IntArray]:
         """Find all pairs of a point and a box within the point's distance. Returns point, box, (n,) int64."""
-        point = np.repeat(np.arange(len(points)), len(self.levels[-1][0]))
-        node = np.tile(np.arange(len(self.levels[-1][0])), len(points))
-        return self._below(points, squared_distance, point, node, len(self.levels) - 1)
-
-    def _below(
-        self, points: FloatArray, squared_distance: FloatArray, point: IntArray, node: IntArray, level: int
-    ) -> tuple[IntArray, IntArray]:
-        """Pairs of a point and a leaf below the given pairs of a point and a node of ``level``."""
-        for depth in range(level, -1, -1):
+        top, leaves = np.arange(len(self.levels[-1][0])), list[tuple[IntArray, IntArray]]()
+        # Pairs of a point and a node of a level.
+        waiting = [(len(self.levels) - 1, np.repeat(np.arange(len(points)), len(top)), np.tile(top, len(points)))]
+        while waiting:
+            level, point, node = waiting.pop()
             if len(point) > MOST_PAIRS:
                 half = len(point) // 2
-                parts = [
-                    self._below(points, squared_distance, point[side], node[side], depth)
-                    for side in (slice(half), slice(half, None))
-                ]
-                return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
-            low, high = self.levels[depth]
+                waiting += [(level, point[side], node[side]) for side in (slice(half, None), slice(half))]
+                continue
+            low, high = self.levels[level]
             gaps = squared_gaps(points.take(point, axis=0), low.take(node, axis=0), high.take(node, axis=0))
             keep = gaps <= squared_distance.take(point)
             point, node = point[keep], node[keep]
-            if depth:
-                point, node = np.repeat(point, WIDTH), (WIDTH * node[:, None] + np.arange(WIDTH)).ravel()
-                exists = node < len(self.levels[depth - 1][0])
-                point, node = point[exists], node[exists]
-        return point, self.order[node]
+            if not level:
+                leaves.append((point, self.order[node]))
+                continue
+            point, node = np.repeat(point, WIDTH), (WIDTH * node[:, None] + np.arange(WIDTH)).ravel()
+            exists = node < len(self.levels[level - 1][0])
+            waiting.append((level - 1, point[exists], node[exists]))
+        point, box = map(np.concatenate, zip(*leaves, strict=True))
+        return point, box
 
 
 def squared_gaps(points: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..evaluation.equations import times_matrix
 from ..evaluation.polynomials import BernsteinBasis, times
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray, ParameterDomain
@@ -133,22 +134,8 @@ def _step(domain: ParameterDomain, at: FloatArray, jet: FloatArray) -> tuple[Flo
 
 def _jet(pieces: PolynomialPieces, piece: IntArray, points: FloatArray, uv: FloatArray) -> FloatArray:
     """``(s, 6, 3)`` differences from points to the surface, and derivatives of the surface by u, v, uu, uv and vv."""
-    powers, degree = pieces.basis.indices, pieces.basis.degree
-    # Powers of both parameters, and their first and second derivatives.
-    value = np.ones((2, len(uv), degree + 1))
-    for k in range(1, degree + 1):
-        np.multiply(value[:, :, k - 1], uv.T, out=value[:, :, k])
-    factor = np.arange(degree + 1, dtype=np.float64)
-    first, second = np.zeros_like(value), np.zeros_like(value)
-    np.multiply(value[:, :, :-1], factor[1:], out=first[:, :, 1:])
-    np.multiply(value[:, :, :-2], (factor * (factor - 1))[2:], out=second[:, :, 2:])
-    (u, v), (du, dv), (duu, dvv) = (
-        (table[0][:, powers[:, 0]], table[1][:, powers[:, 1]]) for table in (value, first, second)
-    )
-    rows = np.empty((len(uv), 6, len(powers)))
-    for number, (along_u, along_v) in enumerate(((u, v), (du, v), (u, dv), (duu, v), (du, dv), (u, dvv))):
-        np.multiply(along_u, along_v, out=rows[:, number])
-    jet: FloatArray = rows @ pieces.monomials[piece]
+    rows = times_matrix(pieces.basis.values(uv)[None], pieces.basis.jets)
+    jet: FloatArray = rows.reshape(len(uv), 6, -1) @ pieces.coefficients[piece]
     jet[:, 0] += pieces.origins[piece] - points
     return jet
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -23,7 +23,7 @@ from .patch_table import PatchTable
 TIP_SIZE = 1 / 64
 # Pieces per run when computing boxes, whose arrays stay in a processor's cache.
 RUN = 1024
-_Parts = TypeVar("_Parts", bound="PartArrays")
+Parts = TypeVar("Parts", bound="PartArrays")
 
 # Halvings of an element, here into 8 by 8 parts, before the coefficients of the parts bound it. A box then exceeds the
 # tight one by some percent of the deviation of a part from a plane, a 64th of that of the element.
@@ -45,16 +45,16 @@ class PartArrays:
     def __len__(self) -> int:
         return len(self._fields[1])
 
-    def chosen(self: _Parts, which: NDArray) -> _Parts:
+    def chosen(self: Parts, which: NDArray) -> Parts:
         """The parts selected by indices or a mask."""
-        make: Callable[..., _Parts] = type(self)
+        make: Callable[..., Parts] = type(self)
         common, *arrays = self._fields
         return make(common, *(array[which] for array in arrays))
 
     @classmethod
-    def joined(cls: type[_Parts], parts: Iterable[_Parts]) -> _Parts:
+    def joined(cls: type[Parts], parts: Iterable[Parts]) -> Parts:
         """Concatenate parts, at least one, whose first field is the same."""
-        make: Callable[..., _Parts] = cls
+        make: Callable[..., Parts] = cls
         (common, *_), *columns = zip(*(part._fields for part in parts), strict=True)
         return make(common, *map(np.concatenate, columns))
 
@@ -71,11 +71,6 @@ class PolynomialPieces(PartArrays):
     offsets: FloatArray
     origins: FloatArray  # (n, 3) float64: points near the pieces, so that small pieces lose no digits
     coefficients: FloatArray  # (n, b, 3) float64: Bernstein coefficients relative to `origins`
-
-    @cached_property
-    def monomials(self) -> FloatArray:
-        """``(n, b, 3)`` coefficients of monomials in u and v, whose exponents are `BernsteinBasis.indices`."""
-        return self.basis.monomials @ self.coefficients
 
     def runs(self, length: int) -> Iterator[tuple[slice, FloatArray]]:
         """Iterate over runs of at most ``length`` pieces, at least one run, with their coefficients ``(b, 3, n)``.
