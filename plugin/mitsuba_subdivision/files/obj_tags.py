@@ -33,7 +33,6 @@ _LIST_TAGS = {
     "hole": (1, 0, "one or more integers and no floats"),
 }
 _HEAD = re.compile(r"\s*(\S+)\s+(\d+)/(\d+)/(\d+)(?!\S)")
-_INTEGER, _DECIMAL = r" (\d{1,15})", r" (\d{1,15}\.?\d{0,20})"
 # Older versions of OpenSubdiv had this tag for the difference between "corners_plus1" and "corners_plus2".
 _PROPAGATE = "facevaryingpropagatecorners"
 
@@ -49,29 +48,19 @@ def read_tags(obj: ObjText) -> tuple[dict[str, Any], dict[str, list[int]]]:
     statements = np.flatnonzero(obj.statements_of(b"t"))
     if not len(statements):
         return {}, {}
-    bounds = np.append(obj.statement_start, len(obj.text))
-    rows: dict[str, list[list[float]]] = {}
-    row_lines: dict[str, list[int]] = {}
-    is_plain = np.zeros(len(statements), dtype=bool)
-    # There may be very many tags of one edge, vertex or face, in the form of `tag_statements`; all other forms, among
-    # them all that are malformed, are read one by one.
-    for kind, (width, has_sharpness, _) in _LIST_TAGS.items():
-        form = rf"^t {kind} {width}/{has_sharpness}/0{_INTEGER * width}{_DECIMAL * has_sharpness}[ \r]*$"
-        plain = list(re.finditer(form.encode(), obj.text, re.MULTILINE))
-        starts = np.array([match.start() for match in plain], np.int64)
-        rows[kind], row_lines[kind] = [[*map(float, match.groups())] for match in plain], obj.lines(starts).tolist()
-        is_plain |= np.isin(bounds[statements], starts)
+    starts = obj.statement_start[statements]
+    ends = np.append(obj.statement_start, len(obj.text))[statements + 1]
+    rows: dict[str, list[list[float]]] = {kind: [] for kind in _LIST_TAGS}
+    row_lines: dict[str, list[int]] = {f"{kind}s": [] for kind in _LIST_TAGS}
     rules: dict[str, str] = {}
     propagates = ""
-    for statement in statements[~is_plain]:
-        start, end = bounds[statement : statement + 2]
-        line = int(obj.lines(start))
+    for start, end, line in zip(starts.tolist(), ends.tolist(), obj.lines(starts).tolist(), strict=True):
         where, tag = f"{obj.name}, line {line}", obj.text[start + 1 : end].decode(errors="backslashreplace")
         name, integers, floats, strings = _values(where, tag)
         if name in _LIST_TAGS:
             listed = _listed(where, name, integers, floats)
             rows[name] += listed
-            row_lines[name] += [line] * len(listed)
+            row_lines[f"{name}s"] += [line] * len(listed)
         elif name in _RULE_TAGS:
             rules |= _rule(where, tag, name, [*integers, *floats, *strings])
         elif name == _PROPAGATE and len(integers) == 1:
@@ -86,15 +75,10 @@ def read_tags(obj: ObjText) -> tuple[dict[str, Any], dict[str, list[int]]]:
     elif propagates:
         rules["face_varying"] = "corners_plus2"
     tags: dict[str, Any] = {"rules": rules}
-    tag_lines = {}
     for kind, (width, has_sharpness, _) in _LIST_TAGS.items():
-        table = np.array(rows[kind], np.float64).reshape(-1, width + has_sharpness)
-        lines = np.array(row_lines[kind], np.int64)
-        # The last of several tags counts.
-        order = np.argsort(lines, kind="stable")
-        tags[f"{kind}s"], tag_lines[f"{kind}s"] = table[order], lines[order].tolist()
+        tags[f"{kind}s"] = np.array(rows[kind], np.float64).reshape(-1, width + has_sharpness)
     tags["holes"] = tags["holes"].ravel().astype(np.int64)
-    return tags, tag_lines
+    return tags, row_lines
 
 
 def _values(where: str, tag: str) -> tuple[str, list[int], list[float], list[str]]:
