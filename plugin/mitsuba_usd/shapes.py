@@ -21,8 +21,10 @@ from mitsuba_subdivision.cage import (
     CageError,
     CageWarning,
     ControlCage,
+    noting_warnings,
     same,
     same_topology,
+    without_warnings,
 )
 from mitsuba_subdivision.mesh import IntArray, ragged
 from mitsuba_subdivision.messages import counted
@@ -97,10 +99,9 @@ class Surfaces:
         for known in alike:
             if same(known.contents, contents):
                 return known
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", CageWarning)
+        with noting_warnings() as messages, without_warnings():
             surface = LimitSurface(ControlCage.from_arrays(**contents.as_arguments()))
-        alike.append(CachedSurface(contents, surface, [str(warning.message) for warning in caught]))
+        alike.append(CachedSurface(contents, surface, messages))
         return alike[-1]
 
     def points(self, contents: SceneContents) -> NDArray[np.float64]:

@@ -7,7 +7,6 @@ of a prototype that look the same become one group of shapes; where that cannot 
 from __future__ import annotations
 
 import math
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -15,13 +14,12 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from mitsuba_subdivision.cage import CageError, CageWarning, shortened, warn
+from mitsuba_subdivision.cage import CageError, noting_warnings, shortened, warn, without_warnings
 from mitsuba_subdivision.files import (
     HIDDEN_PURPOSES,
     local_to_world,
     open_stage,
     require_types,
-    require_usd,
     time_of,
     usd_errors_at,
     usd_messages_of,
@@ -55,8 +53,6 @@ class StageReader:
     """Reads a stage at several times.
 
     Each warning is given once, however many times it applies to. Where cameras alone move, all but them is read once.
-
-    Raises OSError if the file cannot be read.
     """
 
     def __init__(
@@ -65,8 +61,6 @@ class StageReader:
         camera: str | None = None,  # Path of the camera. By default that of the stage's render settings, or the first
         warned: set[str] | None = None,  # Warnings about other files, without their names; those about this are added
     ) -> None:
-        with Path(path).open("rb"):
-            pass  # So that a missing file is an OSError, as for other formats.
         self._path, self._camera = path, camera
         self._stage: Usd.Stage | None = None
         # The first contents, and, from the second time on, whether they stay but for the camera.
@@ -79,28 +73,24 @@ class StageReader:
 
         Without a time code, each value is the one that does not depend on time, or else its first sample.
 
-        Raises ValueError if the time is not finite. Raises CageError if the package usd-core is missing; if the file is
-        malformed; if there is no such camera.
+        Raises ValueError if the time is not finite. Raises CageError if there is no such camera. Other errors are those
+        of `open_stage`.
         """
         if time is not None and not math.isfinite(time):
             raise ValueError(f'"{self._path}": time {time}; expected a finite number, a time code')
-        caught: list[warnings.WarningMessage] = []
+        messages: list[str] = []
         try:
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always", CageWarning)
-                return self._contents(f'"{self._path}"', None if time is None else float(time))
+            with noting_warnings() as messages, without_warnings():
+                return self._contents(f'"{self._path}"', time)
         finally:
-            for warning in caught:
-                message = str(warning.message)
+            for message in messages:
                 what = message.replace(str(self._path), "")
-                if not issubclass(warning.category, CageWarning):
-                    warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
-                elif what not in self._warned:
+                if what not in self._warned:
                     self._warned.add(what)
                     warn(message)
 
     def _contents(self, name: str, time: float | None) -> SceneContents:
-        self._stage = self._stage or open_checked(self._path)
+        self._stage = self._stage or open_stage(self._path, with_documents)
         if self._first is not None and self._is_still is None:
             self._is_still = is_still(self._stage)
         notes = StageWarnings()
@@ -115,14 +105,6 @@ class StageReader:
                 self._first = contents if self._is_still is None else None
         notes.warn(name)
         return contents
-
-
-def open_checked(path: str | Path) -> Usd.Stage:
-    """Open a stage. Raises CageError if the package usd-core is missing, or the file is malformed."""
-    name = f'"{path}"'
-    require_usd(name)
-    with usd_errors_at(name), usd_messages_of(name):
-        return open_stage(path, name, with_documents)
 
 
 def is_still(stage: Usd.Stage) -> bool:

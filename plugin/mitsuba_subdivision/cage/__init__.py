@@ -2,7 +2,7 @@
 
 from .contents import Attribute, CageContents, same, same_topology
 from .control_cage import ControlCage
-from .errors import CageError, CageSource, CageWarning, in_digits, shortened, warn
+from .errors import CageError, CageSource, CageWarning, in_digits, noting_warnings, shortened, warn, without_warnings
 from .validation import require_range
 
 __all__ = [
@@ -13,9 +13,11 @@ __all__ = [
     "CageWarning",
     "ControlCage",
     "in_digits",
+    "noting_warnings",
     "require_range",
     "same",
     "same_topology",
     "shortened",
     "warn",
+    "without_warnings",
 ]

@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cached_property, partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -29,6 +28,8 @@ from .usd_skinning import Skinning
 from .usd_stage import FLAT_SCHEMES, INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, time_of, value_at
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pxr import Usd, UsdGeom
 
 Read = TypeVar("Read")
@@ -49,14 +50,11 @@ def read_usd(
     name = f'"{path}"'
     if time is not None and not math.isfinite(time):
         raise CageError(f"{name}: time {time}; expected a finite number, a time code")
-    with Path(path).open("rb"):
-        pass  # So that a missing file is an OSError, as for other formats.
-    usd_stage.require_usd(name)
+    stage = usd_stage.open_stage(path)
     from pxr import Usd
 
     rules, code = rules or {}, Usd.TimeCode.EarliestTime() if time is None else Usd.TimeCode(float(time))
     with usd_stage.usd_errors_at(name), usd_stage.usd_messages_of(name):
-        stage = usd_stage.open_stage(path, name)
         meshes = usd_stage.chosen_meshes(stage, prim, name, code, rules.get("scheme"))
         locations = [f"{name}, prim {shortened(str(mesh.GetPath()))}" for mesh in meshes]
         skinning = Skinning(code, lambda what, path: warn(f"{name}, prim {shortened(str(path))}: {what}"))

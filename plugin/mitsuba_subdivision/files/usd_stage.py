@@ -51,30 +51,35 @@ def require_usd(name: str, use: str = "reads") -> None:
 
 def open_stage(
     path: str | Path,
-    name: str,  # Beginning of messages
-    # Makes of the stage and its name one that has what USD itself cannot open
+    # Makes of the stage and the beginning of messages one that has what USD itself cannot open
     completed: Callable[[Usd.Stage, str], Usd.Stage] | None = None,
 ) -> Usd.Stage:
-    """Open the stage of a file, with everything that it refers to. Raises CageError if the file is malformed.
+    """Open the stage of a file, with everything that it refers to.
 
-    Warns if the file refers to something that is not there.
+    Raises OSError if the file cannot be read. Raises CageError if the package usd-core is missing, or the file is
+    malformed. Warns if the file refers to something that is not there.
     """
+    with Path(path).open("rb"):
+        pass  # So that a missing file is an OSError, as for other formats.
+    name = f'"{path}"'
+    require_usd(name)
     from pxr import Tf, Usd
 
-    try:
-        stage = Usd.Stage.Open(str(path))
-        if completed is not None:
-            stage = completed(stage, name)
-    except Tf.ErrorException as error:
-        reason = _commentary(error)
-        where = re.match(re.escape(str(Path(path).absolute())) + r":(\d+):\d+: ", reason)
-        if where:
-            # The parser names the rules of its grammar, which are in C++.
-            what = re.sub("parse error matching .* at ", "syntax error at ", reason[where.end() :], flags=re.DOTALL)
-            name, reason = f"{name}, line {where[1]}", what
-        raise CageError(f"{name}: {_clear(reason)}; expected a USD file (is it damaged?)") from None
-    _warn_of_missing(name, [str(error) for error in stage.GetCompositionErrors()])
-    return stage
+    with usd_errors_at(name), usd_messages_of(name):
+        try:
+            stage = Usd.Stage.Open(str(path))
+            if completed is not None:
+                stage = completed(stage, name)
+        except Tf.ErrorException as error:
+            reason = _commentary(error)
+            where = re.match(re.escape(str(Path(path).absolute())) + r":(\d+):\d+: ", reason)
+            if where:
+                # The parser names the rules of its grammar, which are in C++.
+                what = re.sub("parse error matching .* at ", "syntax error at ", reason[where.end() :], flags=re.DOTALL)
+                name, reason = f"{name}, line {where[1]}", what
+            raise CageError(f"{name}: {_clear(reason)}; expected a USD file (is it damaged?)") from None
+        _warn_of_missing(name, [str(error) for error in stage.GetCompositionErrors()])
+        return stage
 
 
 def _warn_of_missing(name: str, errors: list[str]) -> None:
@@ -95,16 +100,11 @@ def _warn_of_missing(name: str, errors: list[str]) -> None:
 
 
 def stage_up_axis(path: str | Path) -> str:
-    """Axis that points up in a USD file: "y" or "z".
-
-    Raises CageError if the package usd-core is missing, or the file is malformed.
-    """
-    name = f'"{path}"'
-    require_usd(name)
+    """Axis that points up in a USD file, "y" or "z"; errors are those of `open_stage`."""
+    stage = open_stage(path)
     from pxr import UsdGeom
 
-    with usd_errors_at(name), usd_messages_of(name):
-        return str(UsdGeom.GetStageUpAxis(open_stage(path, name))).lower()
+    return str(UsdGeom.GetStageUpAxis(stage)).lower()
 
 
 @contextmanager
