@@ -1,28 +1,63 @@
-"""Reader of Wavefront OBJ control cages: whole-array operations on the bytes of the file."""
+"""Reader of Wavefront OBJ control cages: whole-array operations on the bytes of the file.
+
+Tags are those of OpenSubdiv's regression shapes. A statement ``t name i/f/s ..`` gives the tag's name, the numbers of
+its integers, floats and strings, and then these. Vertices and faces count from 0, unlike those of ``f`` statements.
+"""
 
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.contents import Attribute, CageContents
-from ..cage.errors import CageError, CageSource, warn
+from ..cage.errors import CageError, CageSource, shortened, warn
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from .formats import faces_by_name
-from .obj_tags import read_tags
-from .obj_text import SPACE, ObjText, parsed, run_starts
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+_SPACE, _NEWLINE = b" \n"
+_COMMENT = re.compile(rb"#[^\n]*")
+# The name of a material may have a "#" in it, but for one between spaces.
+_MATERIAL, _COMMENT_OF_NAME = re.compile(rb"[ \t]*usemtl[ \t]"), re.compile(rb"[ \t]#(?=\s|$)")
+# Files that are often named ".obj" but are something else, by their first bytes.
+_NO_TEXT = {
+    b"\xff\xfe": "text in UTF-16; expected ASCII or UTF-8",
+    b"\xfe\xff": "text in UTF-16; expected ASCII or UTF-8",
+    b"\x1f\x8b": "compressed with gzip; expected the text, which gunzip makes of it",
+    b"PK\x03\x04": "a zip archive; expected the text file in it",
+    b"BZh": "compressed with bzip2; expected the text, which bunzip2 makes of it",
+}
 _SLASH = ord("/")
 # Patterns for messages; compiled when there is an error.
 _NUMBER = rb"(?i)[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)"
 _CORNER = rb"[+-]?\d+(/[+-]?\d+|/([+-]?\d+)?/[+-]?\d+)?"
+# Tags that choose a rule: the rule, and its values by the tag's integer or string.
+RULE_TAGS: dict[str, tuple[str, dict[Any, str]]] = {
+    "interpolateboundary": ("boundary", {0: "none", 1: "edge_and_corner", 2: "edge_only"}),
+    "facevaryinginterpolateboundary": (
+        "face_varying",
+        dict(enumerate(("none", "corners_only", "corners_plus1", "corners_plus2", "boundaries", "all"))),
+    ),
+    "creasemethod": ("crease_method", {"normal": "uniform", "chaikin": "chaikin"}),
+    "smoothtriangles": ("triangle_rule", {"catmark": "catmull_clark", "smooth": "smooth"}),
+}
+# Tags that list edges, vertices or faces: integers and floats of each one, and what they are in messages.
+_LIST_TAGS = {
+    "crease": (2, 1, "two integers per edge and a float for all or for each"),
+    "corner": (1, 1, "one integer per vertex and a float for all or for each"),
+    "hole": (1, 0, "one or more integers and no floats"),
+}
+_HEAD = re.compile(r"\s*(\S+)\s+(\d+)/(\d+)/(\d+)(?!\S)")
+# Older versions of OpenSubdiv had this tag for the difference between "corners_plus1" and "corners_plus2".
+_PROPAGATE = "facevaryingpropagatecorners"
 
 
 def read_obj(path: str | Path) -> CageContents:
@@ -37,7 +72,7 @@ def read_obj(path: str | Path) -> CageContents:
     ``vt`` statements, as in files that OpenSubdiv writes: the cage is then read without texture coordinates.
     """
     with open(path, "rb") as file:
-        obj = ObjText.split(f'"{path}"', file.read())
+        obj = _ObjText.split(f'"{path}"', file.read())
     is_vertex, is_texcoord, is_face = (obj.statements_of(keyword) for keyword in (b"v", b"vt", b"f"))
     for is_such, what in ((is_vertex, 'vertices ("v" statements)'), (is_face, 'faces ("f" statements)')):
         if not is_such.any():
@@ -65,7 +100,7 @@ def read_obj(path: str | Path) -> CageContents:
             expected = f"1 to {count} (the file has {count} {nouns[1]})"
             if indices[k] < 0:
                 expected = f"-{above[k]} to -1 ({above[k]} {nouns[1]} are above this line)"
-            place = first + run_starts(corners != SPACE)[rows[k]]
+            place = first + _run_starts(corners != _SPACE)[rows[k]]
             raise obj.error(place, f"{nouns[0]} index {indices[k]} is out of range; expected {expected}")
         return absolute
 
@@ -92,7 +127,7 @@ def read_obj(path: str | Path) -> CageContents:
         else:
             texture = Attribute(texcoords, "face_varying", texcoord_indices)
     lines = obj.lines(obj.statement_start)
-    tags, tag_lines = read_tags(obj)
+    tags, tag_lines = _read_tags(obj)
     return CageContents(
         positions,
         sizes,
@@ -104,7 +139,7 @@ def read_obj(path: str | Path) -> CageContents:
     )
 
 
-def _materials(obj: ObjText, is_face: NDArray[np.bool_]) -> dict[str, IntArray]:
+def _materials(obj: _ObjText, is_face: NDArray[np.bool_]) -> dict[str, IntArray]:
     """Faces of each material that the file names."""
     if b"usemtl" not in obj.text:
         return {}
@@ -115,14 +150,14 @@ def _materials(obj: ObjText, is_face: NDArray[np.bool_]) -> dict[str, IntArray]:
 
 
 def _read_numbers(
-    obj: ObjText, chosen: NDArray[np.bool_], keyword: str, noun: str, columns: int, least: int
+    obj: _ObjText, chosen: NDArray[np.bool_], keyword: str, noun: str, columns: int, least: int
 ) -> tuple[NDArray[np.float64], IntArray]:
     """The first ``columns`` numbers of each chosen statement, of at least ``least``, else 0; and how many it has."""
     counts = obj.require_arguments(chosen, noun, least)
     if not len(counts):
         return np.zeros((0, columns)), counts
     text, start = obj.arguments(chosen, len(keyword))
-    values = parsed(text, np.float64, counts.sum())
+    values = _parsed(text, np.float64, counts.sum())
     if values is None:
         raise obj.malformed(text, start, _NUMBER, "a decimal number")
     if (counts == columns).all():
@@ -135,20 +170,239 @@ def _corner_indices(text: NDArray[np.uint8], corner_count: int) -> tuple[IntArra
     """Vertices of face corners, which of these have texture coordinates, and which; None if a corner is malformed."""
     slash = np.flatnonzero(text == _SLASH)
     if len(slash) == 0:
-        vertices = parsed(text, np.int64, corner_count)
+        vertices = _parsed(text, np.int64, corner_count)
         return None if vertices is None else (vertices, vertices[:0], vertices[:0])
-    corner_start = run_starts(text != SPACE)
+    corner_start = _run_starts(text != _SPACE)
     corner = np.searchsorted(corner_start, slash, side="right") - 1
-    begins, ends = text[slash - 1] == SPACE, text[slash + 1] == SPACE
+    begins, ends = text[slash - 1] == _SPACE, text[slash + 1] == _SPACE
     if begins.any() or ends.any() or (corner[2:] == corner[:-2]).any():
         return None
     numbers = text.copy()
-    numbers[slash] = SPACE
-    number_start = run_starts(numbers != SPACE)
-    values = parsed(numbers, np.int64, len(number_start))
+    numbers[slash] = _SPACE
+    number_start = _run_starts(numbers != _SPACE)
+    values = _parsed(numbers, np.int64, len(number_start))
     if values is None:
         return None
     # A texture coordinate follows a corner's first slash, unless another slash does.
     with_texcoord = corner[(np.diff(corner, prepend=-1) != 0) & (text[slash + 1] != _SLASH)]
     vertex = np.searchsorted(number_start, corner_start)
     return values[vertex], with_texcoord, values[vertex[with_texcoord] + 1]
+
+
+def _read_tags(obj: _ObjText) -> tuple[dict[str, Any], dict[str, list[int]]]:
+    """Tags as arguments of `CageContents`, and the lines of each kind as `CageSource` has them.
+
+    If a rule is given more than once, the last value counts.
+
+    Raises CageError if a statement is malformed. Warns if a tag has no effect, so that the surface may differ from what
+    its author saw: hierarchical edits, unknown tags and unknown values.
+    """
+    statements = np.flatnonzero(obj.statements_of(b"t"))
+    if not len(statements):
+        return {}, {}
+    starts = obj.statement_start[statements]
+    ends = np.append(obj.statement_start, len(obj.text))[statements + 1]
+    rows: dict[str, list[list[float]]] = {kind: [] for kind in _LIST_TAGS}
+    row_lines: dict[str, list[int]] = {f"{kind}s": [] for kind in _LIST_TAGS}
+    rules: dict[str, str] = {}
+    propagates = ""
+    for start, end, line in zip(starts.tolist(), ends.tolist(), obj.lines(starts).tolist(), strict=True):
+        where, tag = f"{obj.name}, line {line}", obj.text[start + 1 : end].decode(errors="backslashreplace")
+        name, integers, floats, strings = _values(where, tag)
+        if name in _LIST_TAGS:
+            listed = _listed(where, name, integers, floats)
+            rows[name] += listed
+            row_lines[f"{name}s"] += [line] * len(listed)
+        elif name in RULE_TAGS:
+            rules |= _rule(where, tag, name, [*integers, *floats, *strings])
+        elif name == _PROPAGATE and len(integers) == 1:
+            propagates = where if integers[0] else ""
+        else:
+            warn(f'{where}: tag "{shortened(tag.strip())}" is not supported and has no effect')
+    if propagates and rules.get("face_varying", "corners_plus1") not in ("corners_plus1", "corners_plus2"):
+        warn(
+            f'{propagates}: tag "{_PROPAGATE}" has no effect with the face-varying rule "{rules["face_varying"]}"; '
+            'expected it with "corners_plus1"'
+        )
+    elif propagates:
+        rules["face_varying"] = "corners_plus2"
+    tags: dict[str, Any] = {"rules": rules}
+    for kind, (width, has_sharpness, _) in _LIST_TAGS.items():
+        tags[f"{kind}s"] = np.array(rows[kind], np.float64).reshape(-1, width + has_sharpness)
+    tags["holes"] = tags["holes"].ravel().astype(np.int64)
+    return tags, row_lines
+
+
+def _values(where: str, tag: str) -> tuple[str, list[int], list[float], list[str]]:
+    """Name, integers, floats and strings of a tag."""
+    problem = ""
+    try:
+        if head := _HEAD.match(tag):
+            values = tag[head.end() :].split()
+            integers, floats, strings = map(_integer, head.groups()[1:])
+            if len(values) == integers + floats + strings:
+                numbers = [float(value) for value in values[integers : integers + floats]]
+                return head[1], [*map(_integer, values[:integers])], numbers, values[integers + floats :]
+            problem = f" ({len(values)} values)"
+    except ValueError as error:
+        problem = f" ({shortened(str(error))})"
+    expected = 'expected a name, counts such as "2/1/0", and as many integers, floats and strings'
+    raise CageError(f'{where}: malformed tag "{shortened(tag.strip())}"{problem}; {expected}')
+
+
+def _integer(text: str) -> int:
+    """A number of at most 64 bits. Of more digits than Python converts, `int` itself raises a ValueError."""
+    value = int(text)
+    if value.bit_length() > 63:
+        raise ValueError(f"{text} is out of range")
+    return value
+
+
+def _listed(where: str, name: str, integers: list[int], floats: list[float]) -> list[list[float]]:
+    """Rows of the vertices or the face, and of the sharpness, of which there may be one for all rows."""
+    width, has_sharpness, expected = _LIST_TAGS[name]
+    count = len(integers) // width
+    if not count or len(integers) % width or len(floats) not in ((1, count) if has_sharpness else (0,)):
+        problem = f"tag {name} has {len(integers)} integers and {len(floats)} floats"
+        raise CageError(f"{where}: {problem}; expected {expected}")
+    if len(floats) == 1:
+        floats = floats * count
+    return [integers[width * k : width * (k + 1)] + floats[k : k + 1] for k in range(count)]
+
+
+def _rule(where: str, tag: str, name: str, given: list[Any]) -> dict[str, str]:
+    """The rule that a tag sets; nothing, with a warning, for an unknown value."""
+    rule, values = RULE_TAGS[name]
+    kind, shown = type(next(iter(values))), shortened(tag.strip())
+    if len(given) != 1 or not isinstance(given[0], kind):
+        noun = "string" if kind is str else "integer"
+        raise CageError(f'{where}: tag "{shown}" has the wrong values; expected one {noun}')
+    if given[0] in values:
+        return {rule: values[given[0]]}
+    expected = ", ".join(map(str, values))
+    warn(f'{where}: tag "{shown}" has an unknown value and no effect; expected one of {expected}')
+    return {}
+
+
+@dataclass(frozen=True, eq=False)
+class _ObjText:
+    """Bytes of an OBJ file, split into statements, which are its lines that are not empty.
+
+    Comments and line continuations are overwritten by spaces and never removed, so that the position of a byte always
+    gives its line in the file.
+    """
+
+    name: str
+    text: bytes
+    line_end: IntArray  # Position of each newline in the file.
+    statement_start: IntArray  # Position of the first byte of each statement's keyword.
+    argument_count: IntArray  # Number of tokens after each statement's keyword.
+    is_cut: bool  # Whether the file ends without a newline.
+
+    @classmethod
+    def split(cls, name: str, content: bytes) -> _ObjText:
+        """Raises CageError for a file that is no text of one byte for each character, and names its format."""
+        for begin, what in _NO_TEXT.items():
+            if content.startswith(begin):
+                raise CageError(f"{name}: the file is {what}")
+        if b"\0" in content[:2]:
+            # UTF-16 without a mark has a zero beside each ASCII character.
+            raise CageError(f"{name}: the file is binary, or text in UTF-16; expected ASCII or UTF-8")
+        if content.startswith(b"\xef\xbb\xbf"):
+            content = b"   " + content[3:]
+        if b"\n" not in content:
+            content = content.replace(b"\r", b"\n")
+        line_end = np.flatnonzero(np.frombuffer(content, np.uint8) == _NEWLINE)
+        text, statement_end = content, line_end
+        if b"#" in text:
+            text = _COMMENT.sub(_without_comment, text)
+        if b"\\" in text:
+            if text.rstrip().endswith(b"\\"):
+                line = np.searchsorted(line_end, len(text.rstrip())) + 1
+                raise CageError(f"{name}, line {line}: the file ends in a line continuation; expected another line")
+            text = re.sub(rb"\\\r?\n", lambda match: b" " * len(match[0]), text)
+            statement_end = np.flatnonzero(np.frombuffer(text, np.uint8) == _NEWLINE)
+        # Two bytes more, so that a keyword of two letters can be looked for at every statement.
+        text += b"\n\n"
+
+        token_start = _run_starts(np.frombuffer(text, np.uint8) > _SPACE)
+        first_token = np.append(0, np.searchsorted(token_start, statement_end))
+        counts = np.diff(first_token, append=len(token_start))
+        # An empty line has no token of its own: its first token is that of a later line.
+        starts = token_start[first_token[counts > 0]]
+        return cls(name, text, line_end, starts, counts[counts > 0] - 1, not content.endswith(b"\n"))
+
+    def lines(self, positions: IntArray | int) -> IntArray:
+        """1-based line of each byte position."""
+        return np.searchsorted(self.line_end, positions) + 1
+
+    def statements_of(self, keyword: bytes) -> NDArray[np.bool_]:
+        """Which statements have this keyword of one or two letters."""
+        text = np.frombuffer(self.text, np.uint8)
+        same = text[len(keyword) :].take(self.statement_start) <= _SPACE
+        for place, letter in enumerate(keyword):
+            same &= text[place:].take(self.statement_start) == letter
+        return same
+
+    def arguments(self, chosen: NDArray[np.bool_], keyword_length: int = 1) -> tuple[NDArray[np.uint8], int]:
+        """Arguments of the chosen statements, of which there is one or more.
+
+        As the bytes of the file from the first to the last of these statements, where all else is spaces, and the
+        position of their first byte in the file.
+        """
+        numbers = np.flatnonzero(chosen)
+        bounds = np.append(self.statement_start, len(self.text))[numbers[0] : numbers[-1] + 2]
+        # Control characters count as spaces.
+        text = np.maximum(np.frombuffer(self.text, np.uint8)[bounds[0] : bounds[-1]], np.uint8(_SPACE))
+        text[np.repeat(~chosen[numbers[0] : numbers[-1] + 1], np.diff(bounds))] = _SPACE
+        for letter in range(keyword_length):
+            text[self.statement_start[numbers] + letter - bounds[0]] = _SPACE
+        return text, int(bounds[0])
+
+    def require_arguments(self, chosen: NDArray[np.bool_], noun: str, least: int) -> IntArray:
+        """Argument counts of the chosen statements. Raise an error if one of them has fewer than ``least``."""
+        counts, start = self.argument_count[chosen], self.statement_start[chosen]
+        for short in np.flatnonzero(counts < least)[:1]:
+            raise self.error(start[short], f"{counts[short]} {noun}; expected at least {least}")
+        return counts
+
+    def malformed(self, text: NDArray[np.uint8], first: int, form: bytes, expected: str) -> CageError:
+        """An error about the first token of `arguments` that does not match ``form``; slow."""
+        for token in re.finditer(rb"[^\x00-\x20]+", text.tobytes()):
+            if not re.fullmatch(form, token[0]):
+                shown = shortened(token[0].decode("ascii", "backslashreplace"))
+                return self.error(first + token.start(), f'malformed number "{shown}"; expected {expected}')
+        return CageError(f"{self.name}: malformed numbers; expected {expected}")
+
+    def error(self, position: int, message: str) -> CageError:
+        """An error that names the line of a byte position."""
+        cut = " (the file ends here without a newline: is it cut short?)"
+        is_last = self.is_cut and position >= self.statement_start[-1]
+        return CageError(f"{self.name}, line {self.lines(position)}: {message}{cut if is_last else ''}")
+
+
+def _parsed(text: NDArray[np.uint8], dtype: type[np.generic], count: int) -> NDArray | None:
+    """The ``count`` numbers of a text, or None if it holds anything else."""
+    with warnings.catch_warnings():
+        # For text that is no number, older versions of NumPy warn and newer ones raise an error.
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            values: NDArray = np.fromstring(text.tobytes(), dtype=dtype, sep=" ")
+        except (DeprecationWarning, ValueError):
+            return None
+    return values if len(values) == count else None
+
+
+def _run_starts(inside: NDArray[np.bool_]) -> IntArray:
+    """Positions at which runs of true begin."""
+    begins = inside.copy()
+    np.greater(inside[1:], inside[:-1], out=begins[1:])
+    return np.flatnonzero(begins)
+
+
+def _without_comment(match: re.Match[bytes]) -> bytes:
+    """What comes in place of a comment, or of the name of a material from its first "#" on: most of all, spaces."""
+    text, (start, end) = match.string, match.span()
+    line = text[text.rfind(b"\n", 0, start) + 1 : end]
+    kept = _COMMENT_OF_NAME.split(line)[0] if _MATERIAL.match(line) else b""
+    return kept[len(line) - (end - start) :].ljust(end - start)

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.contents import CageContents
+from ..cage.contents import RULES, CageContents
 from ..whole_file import whole_file
 from .formats import warn_of_losses
-from .obj_tags import rules_without_tag, tag_statements
+from .obj_reader import RULE_TAGS
 
 # Rows that are turned into text at once, which bounds the memory for numbers as Python objects.
 ROWS = 1 << 16
@@ -35,7 +35,7 @@ def write_obj(contents: CageContents, path: str | Path) -> None:
             "scheme": contents.scheme is not None,
             **{f'material "{name}"': not _is_possible(name) for name in contents.materials},
             "further materials of a face": sum(map(len, contents.materials.values())) > (owner >= 0).sum(),
-            **dict.fromkeys(rules_without_tag(contents), True),
+            **dict.fromkeys(_rules_without_tag(contents), True),
         },
     )
     indices, corner = contents.face_vertices + 1, " %d"
@@ -55,7 +55,7 @@ def write_obj(contents: CageContents, path: str | Path) -> None:
         if texcoords is not None:
             stream.writelines(_number_statements("vt", np.asarray(texcoords.values, np.float64)))
         stream.write("".join(faces) % tuple(indices.tolist()))
-        stream.write(tag_statements(contents))
+        stream.write(_tag_statements(contents))
 
 
 def write_obj_triangles(
@@ -92,3 +92,24 @@ def _number_statements(keyword: str, values: NDArray) -> Iterator[str]:
     for start in range(0, len(values), ROWS):
         rows = values[start : start + ROWS]
         yield (form * len(rows)) % tuple(rows.ravel().tolist())
+
+
+def _tag_statements(contents: CageContents) -> str:
+    """Statements of creases, corners and holes, and of rules other than the default."""
+    creases, corners = contents.creases.tolist(), contents.corners.tolist()
+    lines = [f"t crease 2/1/0 {start:.0f} {end:.0f} {sharpness!r}\n" for start, end, sharpness in creases]
+    lines += [f"t corner 1/1/0 {vertex:.0f} {sharpness!r}\n" for vertex, sharpness in corners]
+    lines += [f"t hole 1/0/0 {face}\n" for face in contents.holes.tolist()]
+    for tag, (rule, values) in RULE_TAGS.items():
+        default = RULES[rule][0]
+        value = contents.rules.get(rule, default)
+        given = next((key for key, name in values.items() if name == value), None)
+        if value != default and given is not None:
+            lines.append(f"t {tag} {'0/0/1' if isinstance(given, str) else '1/0/0'} {given}\n")
+    return "".join(lines)
+
+
+def _rules_without_tag(contents: CageContents) -> list[str]:
+    """Rules of a cage whose value no tag of OBJ stands for, as "rule value"."""
+    tagged = {rule: (RULES[rule][0], *values.values()) for rule, values in RULE_TAGS.values()}
+    return [f"{rule} {value}" for rule, value in contents.rules.items() if value not in tagged.get(rule, ())]
