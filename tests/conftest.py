@@ -163,7 +163,7 @@ def _fixture(name: str, variants: list[str] | None = None):
     return fixture
 
 
-for _name in {*_COMPILED, "scalar_rgb", "llvm_ad_rgb", "cuda_ad_rgb"}:
+for _name in {*_COMPILED, "scalar_rgb", "llvm_ad_rgb", "llvm_ad_spectral", "cuda_ad_rgb"}:
     globals()[f"variant_{_name}"] = _fixture(_name)
 for _name, _variants in _GROUPS.items():
     globals()[f"variants_{_name}"] = _fixture(_name, _variants)

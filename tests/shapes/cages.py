@@ -2,6 +2,7 @@
 
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision import upload
 from mitsuba_subdivision.cage import Attribute, named_cages
 from reference.refined_cages import tagged
 
@@ -33,12 +34,21 @@ def textured(**tags):
     )
 
 
-def with_attributes(**tags):
-    """A cube with an attribute of every interpolation, and an island of texture coordinates on each face."""
-    rng = np.random.default_rng(0)
+def with_attributes(cage, seed=0, **tags):
+    """Random values of every interpolation, with seams; each face is an island of texture coordinates."""
+    rng, corners, count = np.random.default_rng(seed), cage.face_vertices, cage.vertex_count
+    angles = np.concatenate([2 * np.pi * np.arange(size) / size for size in cage.face_sizes])
+    islands = 0.5 + 0.1 * np.stack([np.cos(angles), np.sin(angles)], axis=1) + 0.04 * rng.random((len(corners), 2))
+    # Two values for each vertex, of which the first face takes the other.
+    rows = corners + count * (np.arange(len(corners)) >= cage.face_sizes[0])
     attributes = {
-        "colour": Attribute(rng.random((8, 3))),
-        "weight": Attribute(rng.random((8, 1)), "varying"),
-        "label": Attribute(rng.random((24, 1)), "face_varying", np.arange(24)[::-1]),
+        "colour": Attribute(rng.random((count, 3))),
+        "weight": Attribute(rng.random((count, 1)), "varying"),
+        "label": Attribute(rng.random((2 * count, 1)), "face_varying", rows),
     }
-    return cube(texcoords=ISLANDS, attributes=attributes, **tags)
+    given = {"texcoords": Attribute(islands, "face_varying"), "attributes": attributes}
+    return tagged(cage, **{"creases": cage.tags.creases(cage.topology), **given, **tags})
+
+
+def bitmap(image, **more):
+    return {"type": "bitmap", "data": upload(mi.TensorXf, image), "raw": True, **more}

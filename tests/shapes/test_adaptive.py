@@ -10,10 +10,10 @@ from mitsuba_subdivision.shapes.tessellation_parameters import sensor_in_world
 from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
 from patches.closed_cages import bumpy
 from reference.refined_cages import tagged
-from shapes.cages import cube, described, load
+from shapes.cages import cube, load
 from shapes.scenes import SINGLE, all_directions, buffer, film, perspective, rays, scene_with, vertices
 from shapes.updates import update
-from shapes.variants import every_variant, exact_llvm, llvm, scalar, shadings
+from shapes.variants import every_variant, llvm, scalar, shadings
 from tessellation.test_attribute_table import with_seams
 
 ADAPTIVE = {"tessellation": "adaptive", "max_rate": 32}
@@ -117,33 +117,6 @@ def test_pixel_errors_are_seen_from_the_sensor(sensor):
 
 
 @llvm
-def test_an_update_of_the_error_chooses_triangles_anew():
-    shape = make(chord_error=1e-2)
-    scene = scene_with(integrator={"type": "depth"}, sensor=view(), shape=shape)
-    parameters, counts = mi.traverse(scene), [shape.face_count()]
-    for error in (1e-3, 1e-1):
-        update(parameters, {"shape.chord_error": error})
-        counts.append(shape.face_count())
-        assert_same_triangles(shape, make(chord_error=error))
-        assert dr.all(mi.render(scene, spp=1).array >= 0)
-    assert counts[2] < counts[0] < counts[1]
-
-
-@llvm
-def test_control_points_move_through_the_same_triangles_until_they_are_chosen_anew():
-    shape, moved = make(chord_error=1e-2), CAGE.with_positions(CAGE.positions * [1, 1, 3])
-    faces = buffer(shape, "faces")
-    update(shape, control_points=moved.positions.ravel())
-    np.testing.assert_array_equal(buffer(shape, "faces"), faces)
-    distances = LimitSurface(moved).closest_point(buffer(shape, "vertex_positions")).distance
-    assert distances.max() < 10 * SINGLE
-    shape.retessellate()
-    other = make(moved, chord_error=1e-2)
-    assert_same_triangles(shape, other)
-    np.testing.assert_allclose(buffer(shape, "vertex_positions"), buffer(other, "vertex_positions"), atol=10 * SINGLE)
-
-
-@llvm
 @shadings
 def test_not_one_ray_escapes(shading, np_rng):
     """From the middle of a closed creased cage with seams and polygons."""
@@ -153,26 +126,6 @@ def test_not_one_ray_escapes(shading, np_rng):
     shape = load(cage, **error, shading=shading)
     assert shape.vertex_count() > 1000
     assert dr.all(scene_with(shape=shape).ray_test(rays(0 * outwards, outwards)))
-
-
-@llvm
-def test_exact_shading_finds_the_same_surface_from_adaptive_triangles():
-    sensor, pictures = view((32, 32), fov=20), []
-    for parameters in (pixel_error_for(mi.load_dict(sensor), 4.0), {"tessellation_rate": 24}):
-        integrator, shape = {"type": "aov", "aovs": "n:sh_normal,uv:uv"}, described(CAGE, **parameters, shading="exact")
-        scene = scene_with(integrator=integrator, sensor=sensor, surface=shape)
-        pictures.append(np.array(mi.render(scene, spp=4))[..., :3])
-    difference = np.abs(pictures[0] - pictures[1]).max(axis=2)
-    # Outlines may differ by their error, a few pixels.
-    assert np.quantile(difference, 0.9) < 1e-4
-
-
-@exact_llvm
-def test_exact_shading_follows_control_points_that_are_updated_with_the_error():
-    parameters = mi.traverse(make(cube(), chord_error=1e-2, shading="exact"))
-    coefficients = np.array(parameters["shading_coefficients"])
-    update(parameters, control_points=parameters["control_points"] * 2, chord_error=[2e-2])
-    np.testing.assert_allclose(parameters["shading_coefficients"], 2 * coefficients, atol=SINGLE)
 
 
 @scalar

@@ -6,13 +6,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import Attribute, CageWarning, LimitSurface, upload
-from mitsuba_subdivision.cage.named_cages import torus
+from mitsuba_subdivision import CageWarning, upload
 from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
+from mitsuba_subdivision.patches.channel import Channel
 from mitsuba_subdivision.shapes.cage_attributes import mesh_attributes
-from reference.refined_cages import tagged
-from shapes.cages import ISLANDS, cube, described, load, textured, with_attributes
-from shapes.scenes import SINGLE, buffer, down, film, hit, perspective, scene_with
+from shapes.cages import cube, load, textured, with_attributes
+from shapes.scenes import SINGLE, down, hit, perspective, scene_with
 from shapes.updates import update
 from shapes.variants import every_array_variant, every_variant, exact, llvm, shadings
 
@@ -21,36 +20,10 @@ def make(cage, **parameters):
     return load(cage, **{"tessellation_rate": 4, **parameters})
 
 
-@every_variant
-def test_properties_give_the_same_cage_to_every_evaluator_and_flat_faces(np_rng):
-    def assert_textured(cage, **parameters):
-        shape, expected = make(cage, **parameters), LimitSurface(cage).tessellate(4).texcoords
-        assert shape.vertex_count() == len(expected)
-        np.testing.assert_allclose(buffer(shape, "vertex_texcoords"), expected, atol=SINGLE)
-
-    for texcoords in (ISLANDS, *(Attribute(np_rng.random((8, 2)), kind) for kind in ("vertex", "varying"))):
-        assert_textured(cube(texcoords=texcoords, face_varying="none"))
-    assert_textured(with_attributes(), evaluator="stam", sample_offset=1e-3)
-    assert_textured(with_attributes(), face_normals=True)
-
-
-@every_variant
-def test_hits_follow_the_texture_coordinates():
-    shape, step = make(with_attributes(), tessellation_rate=32), 0.05
-    # The islands run along x and y on the top.
-    si, beside = hit(shape), hit(shape, 0.1 + step)
-    moved = np.array(beside.p - si.p).ravel()
-    along = np.array(beside.uv - si.uv).ravel()
-    predicted = np.array(si.dp_du).ravel() * along[0] + np.array(si.dp_dv).ravel() * along[1]
-    # To the second order in the step.
-    assert np.abs(moved - predicted).max() <= step**2
-    assert 0.3 <= np.linalg.norm(along) / step <= 1
-
-
 @llvm
 def test_rendering_takes_the_same_kernels_wherever_arrays_lie():
     """Texture coordinates are read in packets where they are aligned, and one by one where they are not."""
-    cage = with_attributes()
+    cage = with_attributes(cube())
     # Shapes that still live are part of kernels, too.
     gc.collect()
     kernels, kept = set(), []
@@ -68,17 +41,6 @@ def test_rendering_takes_the_same_kernels_wherever_arrays_lie():
 
 
 @every_variant
-def test_values_stay_when_control_points_move():
-    shape = make(with_attributes())
-    names = ("vertex_texcoords", "vertex_colour", "faces", "vertex_normals", "vertex_positions")
-    before = [buffer(shape, name) for name in names]
-    update(shape, control_points=mi.traverse(shape)["control_points"] * 2)
-    before[-1] = 2 * before[-1]
-    for name, values in zip(names, before, strict=True):
-        np.testing.assert_array_equal(buffer(shape, name), values)
-
-
-@every_variant
 def test_attributes_that_mitsuba_cannot_evaluate_are_told_of_and_no_parameters():
     pair = 'attribute "pair" has 2 numbers per value and is left out; Mitsuba evaluates attributes of 1 or'
     normals = 'attribute "normals" is left out; every Mitsuba mesh has "normals" already'
@@ -89,29 +51,6 @@ def test_attributes_that_mitsuba_cannot_evaluate_are_told_of_and_no_parameters()
     with pytest.warns(CageWarning, match=pair):
         shown = mi.traverse(load(cage)).keys()
     assert {key for key in shown if key.startswith("cage_")} == {"cage_colour"}
-
-
-@every_variant
-def test_a_texture_is_seen():
-    # Texture coordinates that are the vertices' own positions are the surface's points.
-    cage = torus(12, 8)
-    cage = tagged(cage, texcoords=cage.positions[:, :2])
-    to_world = mi.ScalarTransform4f().look_at([0, 0, 5], [0, 0, 0], [0, 1, 0]).scale(2)
-    checkerboard = {"type": "checkerboard", "color0": 0.0, "color1": 1.0}
-    scene = {
-        "type": "scene",
-        "integrator": {"type": "aov", "aovs": "albedo:albedo,uv:uv,p:position"},
-        "sensor": {"type": "orthographic", "to_world": to_world, "film": film(32)},
-        "shape": described(cage, tessellation_rate=4, bsdf={"type": "diffuse", "reflectance": checkerboard}),
-    }
-    picture = np.array(mi.render(mi.load_dict(scene), spp=1))
-    albedo, uv, position = picture[..., -8], picture[..., -5:-3], picture[..., -3:]
-    covered = np.abs(position).max(axis=2) > 0
-    np.testing.assert_allclose(uv[covered], position[covered][:, :2], atol=10 * SINGLE)
-    is_white = np.logical_xor(*(position[covered][:, :2] % 1 > 0.5).T)
-    np.testing.assert_array_equal(albedo[covered], is_white)
-    assert covered.sum() > 200
-    assert 0.3 < is_white.mean() < 0.7
 
 
 OF_MITSUBA = {
@@ -256,3 +195,20 @@ def test_textured_emitters_light_as_with_vertex_shading(kind, displacement):
         means.append(np.array(mi.render(scene, spp=256)).mean())
     np.testing.assert_allclose(points[0], points[1], rtol=0, atol=DRAWN)
     assert means[0] == pytest.approx(means[1], rel=0.01)
+
+
+@every_variant
+def test_what_users_assign_to_vertices_stays_until_the_cage_is_updated_for_which_alone_weights_are_made(monkeypatch):
+    shape = make(with_attributes(cube()))
+    parameters = mi.traverse(shape)
+    assigned = upload(type(parameters["vertex_colour"]), 0.5 * np.array(parameters["vertex_colour"]))
+    update(parameters, vertex_colour=assigned, cage_weight=parameters["cage_weight"] * 2)
+    with monkeypatch.context() as patched:
+        patched.setattr(Channel, "weights", None)
+        update(parameters, control_points=parameters["control_points"] * 2)
+        update(make(with_attributes(cube())), control_points=parameters["control_points"])
+    np.testing.assert_array_equal(np.array(mi.traverse(shape)["vertex_colour"]), np.array(assigned))
+    parameters["cage_colour"] = parameters["cage_colour"] * 1
+    parameters.set_dirty("cage_colour")
+    parameters.update()
+    np.testing.assert_allclose(np.array(mi.traverse(shape)["vertex_colour"]), 2 * np.array(assigned), atol=SINGLE)

@@ -9,7 +9,7 @@ from mitsuba_subdivision.cage import named_cages
 from reference.refined_cages import tagged
 from shapes.cages import RING, cube, load
 from shapes.scenes import all_directions, perspective, rays, scene_with, vertices, waves
-from shapes.updates import MODES, assign_cage, derivative, differentiated, moving, update
+from shapes.updates import differentiated, update
 from shapes.variants import every_variant, exact, exact_llvm, llvm, shadings
 
 # Places and normals in single precision, of a cage of size one; normals take differences of differences.
@@ -284,74 +284,8 @@ def test_nothing_moves_where_there_is_no_normal():
     np.testing.assert_allclose(np.abs(p[~folded, 2]), SCALE, rtol=0, atol=SINGLE)
 
 
-def derivatives(assign, loss):
-    return [derivative(mode, assign, loss, GRADIENT_STEP) for mode in MODES]
-
-
-@llvm
-@pytest.mark.parametrize("of", ["positions", "normals"])
-@pytest.mark.parametrize("by", ["control_points", "to_world", "displacement.data", "displacement_scale", "cage_height"])
-@pytest.mark.parametrize("name", ["creased islands", "valence 5"])
-def test_derivatives_of_vertices_are_central_differences(name, by, of, np_rng):
-    parameters = mi.traverse(make(CAGES[name](), "vertex_height" if by == "cage_height" else bitmap(), MATRIX))
-    size = dr.width(parameters[f"vertex_{of}"])
-    weights = upload(mi.Float, np_rng.normal(size=size).astype(np.float32) / np.sqrt(size))
-    assign = moving(parameters, by, np_rng)
-    backward, forward, difference = derivatives(assign, lambda: dr.sum(weights * parameters[f"vertex_{of}"]))
-    assert backward == pytest.approx(difference, abs=GRADIENT)
-    assert forward == pytest.approx(backward, abs=1e-2 * GRADIENT)
-
-
 def key_of(parameters, by):
     return next(key for key in parameters.keys() if key.endswith(by))  # noqa: SIM118 - it iterates over pairs
-
-
-@exact_llvm
-@pytest.mark.parametrize("by", ["control_points", "to_world", "displacement_scale", "cage_height", "data"])
-def test_derivatives_of_normals_at_hits_are_central_differences(by, np_rng):
-    # Slopes of the attribute are smooth. Those of a bitmap jump along lines between its texels' centres, and what rays
-    # meet does not know that the lines move; where points stay on the surface, it does not matter.
-    displacement, more = (bitmap(), mi.RayFlags.FollowShape) if by == "data" else ("vertex_height", 0)
-    scene = scene_with(shape=make(CAGES["cube"](), displacement, shading="exact"))
-    parameters, along = mi.traverse(scene), view(32, fov=12)
-    weights = upload(mi.Normal3f, (np_rng.normal(size=(3, 32 * 32)) / 32).T)
-
-    def loss():
-        si = scene.ray_intersect(along, int(mi.RayFlags.All | more), coherent=True)
-        return dr.sum(dr.dot(weights, si.sh_frame.n))
-
-    backward, forward, difference = derivatives(moving(parameters, key_of(parameters, by), np_rng), loss)
-    if by == "data":
-        assert abs(backward) > GRADIENT
-        assert forward == pytest.approx(backward, abs=1e-2 * GRADIENT)
-    else:
-        assert backward == pytest.approx(difference, abs=HIT_GRADIENT)
-        assert forward == pytest.approx(backward, abs=1e-3)
-
-
-@llvm
-@pytest.mark.parametrize(
-    ("by", "shading"),
-    [
-        *((by, "vertex") for by in ("displacement.data", "displacement_scale", "control_points", "cage_height")),
-        pytest.param("cage_height", "exact", marks=exact),
-    ],
-)
-def test_each_of_two_losses_after_one_update_has_its_gradient(by, shading, np_rng):
-    displacement = "vertex_height" if by == "cage_height" else bitmap()
-    parameters = mi.traverse(make(CAGES["creased islands"](), displacement, shading=shading))
-    given, size = differentiated(parameters, by), dr.width(parameters["vertex_positions"])
-    weights = [upload(mi.Float, np_rng.normal(size=size)) for _ in range(2)]
-    for name in ("positions", "normals") if shading == "vertex" else ("positions",):
-        gradients = []
-        for weight in [*weights, weights[0] + weights[1]]:
-            dr.backward(dr.sum(weight * parameters[f"vertex_{name}"]))
-            gradients.append(np.array(dr.grad(given)).ravel())
-            dr.clear_grad(given)
-        assert np.abs(gradients[0]).max() > 0
-        np.testing.assert_allclose(
-            gradients[0] + gradients[1], gradients[2], rtol=0, atol=1e-4 * np.abs(gradients[2]).max()
-        )
 
 
 @exact_llvm
@@ -367,16 +301,6 @@ def test_interactions_detached_from_shapes_have_no_derivatives_by_heights(by):
         dr.clear_grad(given)
     assert gradients[0] > 0
     assert gradients[1] == 0
-
-
-@every_variant
-def test_updates_of_heights_and_scale_move_the_surface():
-    cage, other = CAGES["islands"](), 1 - IMAGE
-    shape = make(cage, bitmap())
-    parameters = update(shape, {"displacement.data": upload(mi.TensorXf, other[..., None])})
-    assert_alike(shape, make(cage, bitmap(other)))
-    update(parameters, displacement_scale=0.4)
-    assert_alike(shape, make(cage, bitmap(other), displacement_scale=0.4), SINGLE)
 
 
 @exact_llvm
@@ -400,48 +324,11 @@ def test_an_update_that_is_refused_changes_nothing_else(refused):
     np.testing.assert_array_equal(vertices(shape)[0], before[0])
 
 
-def other_values(cage):
-    height, given = 1 - cage.attributes["height"].values, cage.texcoords
-    texcoords = Attribute(0.9 * given.values + 0.1, given.interpolation, given.indices)
-    creases = cage.tags.creases(cage.topology)
-    return tagged(cage, texcoords=texcoords, attributes={"height": height}, creases=creases)
-
-
-@every_variant
-@pytest.mark.parametrize("kind", ["vertex_height", "bitmap"])
-@pytest.mark.parametrize("triangles", TRIANGLES, ids=["even", "adaptive"])
-def test_the_surface_follows_what_heights_depend_on(kind, triangles):
-    cage = CAGES["creased islands"]()
-    shape = make(cage, heights(kind), **triangles)
-    before, _ = vertices(shape)
-    assign_cage(shape, other_values(cage))
-    if triangles:
-        # The new heights ask for other triangles.
-        shape.retessellate()
-    assert_alike(shape, make(other_values(cage), heights(kind), **triangles), NORMAL)
-    after, _ = vertices(shape)
-    assert len(before) != len(after) or np.abs(before - after).max() > 0.01
-
-
 @every_variant
 @pytest.mark.parametrize("triangles", TRIANGLES, ids=["even", "adaptive"])
 def test_a_texture_of_one_value_displaces_as_a_bitmap_of_that_value(triangles):
     textures = {"type": "uniform", "value": 0.3}, bitmap(np.full_like(IMAGE, 0.3))
     assert_alike(*(make(CAGES["cube"](), texture, **triangles) for texture in textures), NORMAL)
-
-
-@exact_llvm
-@pytest.mark.parametrize("kind", ["vertex_height", "bitmap"])
-def test_hits_follow_what_heights_depend_on(kind):
-    cage = CAGES["cube"]()
-    shape = make(cage, heights(kind), shading="exact")
-    assign_cage(shape, other_values(cage))
-    expected = make(other_values(cage), heights(kind), shading="exact")
-    (_, si, valid), (_, at, others) = hits(shape), hits(expected)
-    np.testing.assert_array_equal(valid, others)
-    assert valid.sum() > 100
-    # A few rays along outlines meet the surface elsewhere.
-    assert typical(np.array(si.sh_frame.n).T[valid], np.array(at.sh_frame.n).T[valid], 0.99) < HIT_NORMAL
 
 
 def extraordinary(truth, corner, uv):
@@ -488,25 +375,6 @@ def test_normals_at_extraordinary_vertices_of_a_plane_are_limits():
     at = extraordinary(truth, corner, uv)
     near = truth.normals(corner[at], np.full((len(at), 2), 2 * STEP))
     np.testing.assert_allclose(vertices(make(flat, "vertex_height"))[1][at], near, rtol=0, atol=1e-3)
-
-
-@pytest.mark.threads
-@every_variant
-def test_scenes_in_xml_have_displacement_too(tmp_path):
-    cage = tagged(cube(), texcoords=CAGES["islands"]().texcoords)
-    cage.save(tmp_path / "cage.obj")
-    mi.util.write_bitmap(str(tmp_path / "heights.exr"), IMAGE[..., None], write_async=False)
-    text = f"""<scene version="3.0.0"><shape type="subdivision">
-        <string name="filename" value="{tmp_path / "cage.obj"}"/>
-        <integer name="tessellation_rate" value="{RATE}"/>
-        <texture type="bitmap" name="displacement">
-            <string name="filename" value="{tmp_path / "heights.exr"}"/><boolean name="raw" value="true"/>
-            <transform name="to_uv"><rotate value="0, 0, 1" angle="{TURN}"/></transform>
-        </texture>
-        <float name="displacement_scale" value="{SCALE}"/>
-    </shape></scene>"""
-    p, _ = vertices(mi.load_string(text).shapes()[0])
-    np.testing.assert_allclose(p, vertices(make(cage, bitmap()))[0], rtol=0, atol=2 * SINGLE)
 
 
 @every_variant

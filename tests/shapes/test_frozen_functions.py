@@ -4,6 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from mitsuba_subdivision import Attribute
 from mitsuba_subdivision.device_arrays import upload
 from shapes.cages import cube, described
 from shapes.scenes import perspective, scene_with
@@ -12,7 +13,8 @@ from shapes.variants import exact, shadings
 
 # A scene that is freed while a function is being frozen, or before it runs again, is one that Dr.Jit misses.
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb", "no_other_scene")
-KEYS = {"points": "control_points", "world": "to_world", "colour": "cage_colour", "scale": "displacement_scale"}
+KEYS = {"points": "control_points", "world": "to_world", "scale": "displacement_scale"}
+KEYS |= {"colour": "cage_colour", "texcoords": "cage_texcoords"}
 # Dr.Jit adds gradients of pixels in no fixed order.
 ORDER_OF_SUMS = 1e-5
 
@@ -20,12 +22,15 @@ ORDER_OF_SUMS = 1e-5
 def loaded(shading, **parameters):
     """A scene, and its parameters, in which everything that may be updated matters."""
     rng = np.random.default_rng(0)
-    cage = cube(attributes={"colour": rng.random((8, 3)), "height": rng.random((8, 1))})
+    texcoords = Attribute(rng.random((8, 2)), "varying")
+    cage = cube(texcoords=texcoords, attributes={"colour": rng.random((8, 3)), "height": rng.random((8, 1))})
     rate = {} if "tessellation" in parameters else {"tessellation_rate": 2}
     bsdf = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}}
-    film = {"type": "hdrfilm", "width": 8, "height": 8}
-    seen = {"integrator": {"type": "direct"}, "sensor": perspective(film, [4, -6, 4]), "sky": {"type": "constant"}}
-    scene = scene_with(**seen, shape=described(cage, shading=shading, bsdf=bsdf, **rate, **parameters))
+    # One hit takes less time to compile than paths of light.
+    integrator = {"type": "aov", "aovs": "normals:sh_normal,colours:albedo,texcoords:uv"}
+    sensor = perspective({"type": "hdrfilm", "width": 8, "height": 8}, [4, -6, 4])
+    shape = described(cage, shading=shading, bsdf=bsdf, **rate, **parameters)
+    scene = scene_with(integrator=integrator, sensor=sensor, shape=shape)
     return scene, mi.traverse(scene)
 
 
@@ -37,8 +42,8 @@ def value(by, number):
     """New values of a parameter on the device, which no kernel has compiled in."""
     if by == "points":
         return upload(mi.Float, cube().positions * (1 + number / 10))
-    if by == "colour":
-        return upload(mi.Float, np.full((8, 3), number / 5))
+    if by in ("colour", "texcoords"):
+        return upload(mi.Float, np.linspace(0, number / 5, 24 if by == "colour" else 16))
     tenths = dr.opaque(mi.Float, number / 10)
     return mi.Transform4f().translate([tenths, 0, 0]) if by == "world" else tenths
 

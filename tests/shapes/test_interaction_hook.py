@@ -19,7 +19,6 @@ from mitsuba_subdivision.shapes import exact_shading, interaction_hook, machine_
 from reference.refined_cages import sheet
 from shapes.cages import described, load
 from shapes.scenes import down, perspective, rows, scene_with
-from shapes.updates import update
 from shapes.variants import every_array_variant, llvm
 
 pytestmark = pytest.mark.threads
@@ -266,28 +265,6 @@ def test_an_interruption_is_raised_when_mitsuba_has_returned():
 
 
 # Frozen functions and instances
-
-
-@pytest.mark.parametrize("parameters", [{}, {"vertex_heat": 1}, {"scheme": "doo_sabin"}])
-@pytest.mark.usefixtures("no_other_scene", "variant_llvm_ad_rgb")
-def test_frozen_functions_render_as_others(parameters):
-    if "vertex_heat" in parameters:
-        bsdf = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_heat"}}
-        parameters = {"vertex_heat": heat(), "bsdf": bsdf}
-
-    def render(scene, seed):
-        return mi.render(scene, spp=2, seed=seed)
-
-    for shading in ("vertex", "exact"):
-        scene = scene_of(make(shading=shading, **parameters))
-        points, frozen = mi.traverse(scene), dr.freeze(render)
-        for seed in range(4):
-            expected = np.array(render(scene, mi.UInt32(seed)))
-            np.testing.assert_array_equal(np.array(frozen(scene, mi.UInt32(seed))), expected)
-            if seed == 1:
-                update(points, {"shape.control_points": points["shape.control_points"] * 1.1})
-        # Once, and again where control points have become an array of their own, or another scene is gone.
-        assert frozen.n_recordings < 4
 
 
 @pytest.fixture

@@ -95,6 +95,8 @@ def interaction_and_attributes(at):
     close(at.shape.differential_motion(at.si), numbers(at.si.p))
     close(at.shape.ray_intersect_triangle(at.preliminary.prim_index, at.ray).t, numbers(at.preliminary.t))
     p = numbers(at.si.p)
+    close(at.si.uv, p[:2], HIT)
+    close(numbers([at.si.dp_du.xy, at.si.dp_dv.xy]), [1, 0, 0, 1], 10 * HIT)
     close(at.shape.eval_attribute("vertex_color", at.si), p / 2 + 0.5, HIT)
     close(at.shape.eval_attribute_3("vertex_color", at.si), p / 2 + 0.5, HIT)
     close(at.shape.eval_attribute_1("vertex_weight", at.si), p[0], HIT)

@@ -8,8 +8,8 @@ from mitsuba_subdivision import LimitSurface, upload
 from mitsuba_subdivision.cage import named_cages
 from shapes.cages import ISLANDS, RING, cube, load
 from shapes.scenes import SINGLE, buffer, down, scene_with, vertices
-from shapes.updates import derivative, update
-from shapes.variants import every_ad_variant, every_variant, llvm, shadings
+from shapes.updates import update
+from shapes.variants import every_variant, llvm, shadings
 
 # Degrees between exact normals and those of float32 sums, wherever the shape is; 3e-5 are measured.
 NORMAL_ERROR = 1e-4
@@ -125,26 +125,6 @@ def test_derivatives_by_control_points_are_the_same_far_away(shading, mode):
     np.testing.assert_allclose(derivatives[1], derivatives[0], rtol=0, atol=10 * SINGLE * np.abs(derivatives[0]).max())
 
 
-@pytest.mark.parametrize("name", ["far", "turned", "mirrored"])
-@cages
-@every_variant
-def test_an_update_of_to_world_is_a_new_shape(monkeypatch, cage, name):
-    shape, to_world = make(cage), transformation(name)
-    with monkeypatch.context() as patched:
-        # Weights are not made again.
-        patched.setattr("mitsuba_subdivision.surface.limit_surface.uniform_table", None)
-        update(shape, to_world=to_world)
-    expected = make(cage, to_world=to_world)
-    assert_alike(shape, expected)
-    (p, n), (positions, normals) = vertices(shape), placed(cage, to_world)
-    # A unit in the last place of the largest coordinate.
-    np.testing.assert_allclose(p, positions, rtol=0, atol=max(10 * SINGLE, 2**-10 * (name == "far")))
-    assert largest_angle(n, normals) <= NORMAL_ERROR
-    assert dr.allclose(shape.bbox().max, expected.bbox().max)
-    update(shape, to_world=mi.ScalarTransform4f())
-    assert_alike(shape, make(cage))
-
-
 @cages
 @every_variant
 def test_other_evaluators_are_placed_as_well(cage):
@@ -191,47 +171,3 @@ def test_control_points_are_in_object_space_and_to_world_is_of_the_type_that_mit
     assert shown.flags("to_world") == expected.flags("to_world")
     update(shown, control_points=shown["control_points"] * 2)
     np.testing.assert_allclose(buffer(shape, "vertex_positions") - [3, 0, 0], 2 * before, atol=SINGLE)
-
-
-@pytest.mark.usefixtures("no_other_scene")
-@pytest.mark.parametrize("name", ["none", "identity", "turned", "mirrored"])
-@cages
-@every_ad_variant
-def test_derivatives_by_to_world_and_control_points_are_differences(np_rng, cage, name):
-    parameters, start = mi.traverse(make(cage)), transformation("identity" if name == "none" else name)
-    points = np.array(parameters["control_points"])
-    change, turn = np_rng.normal(size=points.shape), np_rng.normal(size=(4, 4)) * [[1], [1], [1], [0]]
-    turn *= name != "none"
-    weights = np_rng.normal(size=(2, *LimitSurface(cage).tessellate(RATE).positions.shape))
-
-    def exact(step):
-        moved = cage.with_positions(cage.positions + step * change.reshape(-1, 3))
-        return (weights * placed(moved, matrix_of(start) + step * turn)).sum()
-
-    step = 1e-5
-    expected = (exact(step) - exact(-step)) / (2 * step)
-
-    def assign(step):
-        given = {"control_points": upload(mi.Float, points) + step * upload(mi.Float, change)}
-        if name != "none":
-            matrix = dr.detach(mi.AffineTransform4f(start).matrix) + step * mi.Matrix4f(turn.tolist())
-            given["to_world"] = mi.AffineTransform4f(matrix)
-        update(parameters, given)
-
-    def loss():
-        names = ("vertex_positions", "vertex_normals")
-        return sum(dr.dot(parameters[n], upload(mi.Float, w)) for n, w in zip(names, weights, strict=True))
-
-    for mode in ("forward", "backward"):
-        # Sums of some hundred terms of float32.
-        assert derivative(mode, assign, loss) == pytest.approx(expected, rel=1e-4, abs=1e-3), mode
-
-
-@every_ad_variant
-def test_gradients_by_to_world_alone():
-    shape, shift = make(cube()), mi.Float(2)
-    dr.enable_grad(shift)
-    parameters = update(shape, to_world=mi.AffineTransform4f().translate([shift, 0, 0]))
-    assert shape.parameters_grad_enabled()
-    dr.backward(dr.sum(dr.unravel(mi.Point3f, parameters["vertex_positions"]).x))
-    assert dr.allclose(dr.grad(shift), shape.vertex_count())

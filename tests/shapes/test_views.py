@@ -8,8 +8,8 @@ import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest
-from mitsuba_subdivision import CageWarning, upload
-from shapes.cages import ISLANDS, RING, cube, described, load
+from mitsuba_subdivision import CageWarning, ControlCage
+from shapes.cages import ISLANDS, MIXED_FACES, RING, bitmap, cube, described, load, with_attributes
 from shapes.scenes import buffer, perspective, scene_with
 from shapes.updates import derivative, differentiated, update
 from shapes.variants import every_ad_variant, exact
@@ -84,6 +84,53 @@ def test_each_view_has_its_gradients_however_they_are_asked_for(integrator, shad
         assert np.linalg.norm(gradient - expected) <= ROUNDING * np.linalg.norm(expected), case
 
 
+COLOURED = cube(texcoords=ISLANDS, attributes={"colour": cube().positions + 0.6})
+COLOUR = {"bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}}}
+
+
+def texels():
+    return bitmap(np.eye(4)[..., None])
+
+
+def textured():
+    return {"bsdf": {"type": "diffuse", "reflectance": texels()}}
+
+
+# What is differentiated together, and parameters of the shape, made when a variant is set.
+TOGETHER = [
+    (("control_points", "cage_colour"), lambda: COLOUR),
+    (("control_points", "cage_texcoords"), textured),
+    (("cage_weight", "cage_colour"), lambda: {**COLOUR, "displacement": "vertex_weight", "displacement_scale": 0.1}),
+    (
+        ("displacement.data", "displacement_scale", "control_points"),
+        lambda: {"displacement": texels(), "displacement_scale": 0.1},
+    ),
+    pytest.param(("cage_colour",), lambda: {**COLOUR, "shading": "exact"}, marks=exact),
+    pytest.param(("cage_texcoords",), lambda: {**textured(), "shading": "exact"}, marks=exact),
+]
+
+
+@pytest.mark.parametrize(("names", "parameters"), TOGETHER)
+def test_gradients_of_views_are_those_of_their_sum_alone_and_together(names, parameters):
+    scene = views_of("direct", with_attributes(ControlCage(cube().positions, MIXED_FACES)), **parameters())
+    parameters, keys = mi.traverse(scene), [f"shape.{name}" for name in names]
+    alone = []
+    for key in keys:
+        values = differentiated(parameters, key)
+        dr.backward(msub.loss_of_views(scene, parameters, loss_of, spp=4))
+        alone.append(np.array(dr.grad(values)).ravel())
+        update(parameters, {key: dr.detach(values)})
+    values = [type(parameters[key])(dr.detach(parameters[key])) for key in keys]
+    dr.enable_grad(values)
+    update(parameters, dict(zip(keys, values, strict=True)))
+    for view in range(VIEWS):
+        dr.backward(loss_at(scene, parameters, view))
+    for key, value, expected in zip(keys, values, alone, strict=True):
+        assert np.abs(expected).max() > 0
+        tolerance = 10 * ROUNDING * np.abs(expected).max()
+        np.testing.assert_allclose(np.array(dr.grad(value)).ravel(), expected, rtol=0, atol=tolerance, err_msg=key)
+
+
 def test_an_optimiser_needs_one_update_for_all_views():
     scene = views_of("prb")
     parameters, gradients = mi.traverse(scene), []
@@ -108,12 +155,6 @@ def test_what_users_assign_to_vertices_stays_when_gradients_pass():
     np.testing.assert_array_equal(parameters[key], dr.detach(attached) * 2)
 
 
-def bitmap():
-    return {"type": "bitmap", "data": upload(mi.TensorXf, np.eye(4)[..., None]), "raw": True}
-
-
-COLOURED = cube(texcoords=ISLANDS, attributes={"colour": cube().positions + 0.6})
-COLOUR = {"bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}}}
 POINTS = "control_points or to_world"
 HEIGHTS = "control_points, to_world or heights"
 
@@ -124,8 +165,8 @@ HEIGHTS = "control_points, to_world or heights"
         (KEY, dict, POINTS),
         ("shape.to_world", dict, POINTS),
         ("shape.cage_colour", lambda: COLOUR, "cage_colour"),
-        ("shape.displacement.data", lambda: {"displacement": bitmap()}, HEIGHTS),
-        ("shape.displacement_scale", lambda: {"displacement": bitmap()}, HEIGHTS),
+        ("shape.displacement.data", lambda: {"displacement": texels()}, HEIGHTS),
+        ("shape.displacement_scale", lambda: {"displacement": texels()}, HEIGHTS),
     ],
 )
 def test_gradients_that_end_at_the_shape_are_told_of(key, parameters, told):

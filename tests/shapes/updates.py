@@ -55,17 +55,19 @@ def derivative(mode, assign, loss, step=1e-3):
     return float(np.array(dr.grad(value if mode == "forward" else by)).ravel()[0])
 
 
-def moving(parameters, by, rng):
-    """Function that moves a parameter along a random direction by so many steps."""
-    is_matrix = by.endswith("to_world")
-    start = dr.opaque(parameters[by].matrix if is_matrix else parameters[by])
-    along = rng.normal(size=np.array(start).shape)
-    if is_matrix:
-        along[3] = 0
-    along = type(start)(along.tolist()) if is_matrix else upload(type(start), along)
+def moving(parameters, names, rng):
+    """Function that moves parameters, all in one update, each along a random direction, by so many steps."""
+    starts, alongs = {}, {}
+    for name in [names] if isinstance(names, str) else names:
+        is_matrix = name.endswith("to_world")
+        starts[name] = start = dr.opaque(parameters[name].matrix if is_matrix else parameters[name])
+        along = rng.normal(size=np.array(start).shape)
+        if is_matrix:
+            along[3] = 0
+        alongs[name] = type(start)(along.tolist()) if is_matrix else upload(type(start), along)
 
     def assign(step):
-        value = start + along * step
-        update(parameters, {by: mi.AffineTransform4f(value) if is_matrix else value})
+        values = {name: start + alongs[name] * step for name, start in starts.items()}
+        update(parameters, {k: mi.AffineTransform4f(v) if k.endswith("to_world") else v for k, v in values.items()})
 
     return assign
