@@ -1,17 +1,15 @@
 // OpenSubdiv's limit surface of any cage at given parameters.
 //
-//   osd_peer QUERIES ANSWERS [--method far|bfr|refine] [--level n] [--real float|double]
-//            [--scheme catmark|loop|bilinear] [--boundary none|edge_only|edge_and_corner] [--creasing uniform|chaikin]
+//   osd_peer QUERIES ANSWERS [--method far|refine] [--level n] [--real float|double] [--scheme catmark|loop]
+//            [--boundary none|edge_only|edge_and_corner] [--creasing uniform|chaikin]
 //            [--triangles catmark|smooth] [--fvar all|none|boundaries|corners_only|corners_plus1|corners_plus2]
 //
 //   far      adaptive refinement to the level, a patch table with Gregory end caps, EvaluateBasis
-//   bfr      Bfr::Surface of each face that is asked for, which approximates smooth and sharp features at the level
 //   refine   uniform refinement to the level and limit masks: only parameters that are vertices of that level have a
 //            value; du and dv are two tangents at the vertex, whatever the directions of its edges
 #include "peer_common.h"
 #include <array>
 #include <memory>
-#include <opensubdiv/bfr/refinerSurfaceFactory.h>
 #include <opensubdiv/far/patchMap.h>
 #include <opensubdiv/far/patchTableFactory.h>
 #include <opensubdiv/far/primvarRefiner.h>
@@ -44,12 +42,6 @@ private:
     R *data_;
 };
 
-template <class R> std::vector<R> rows_for(const std::vector<double> &values, int width, int count) {
-    std::vector<R> data(values.begin(), values.end());
-    data.resize(size_t(width) * count);
-    return data;
-}
-
 template <class R>
 void combine(const Rows<R> &rows, const Far::ConstIndexArray &points, const R *weights, int width, double *out,
              R scale = 1) {
@@ -62,7 +54,7 @@ void combine(const Rows<R> &rows, const Far::ConstIndexArray &points, const R *w
 static std::unique_ptr<Refiner> make_refiner(const Cage &cage, const Arguments &a) {
     using O = Sdc::Options;
     auto scheme = a.choice<Sdc::SchemeType>("scheme", "catmark",
-        {{"catmark", Sdc::SCHEME_CATMARK}, {"loop", Sdc::SCHEME_LOOP}, {"bilinear", Sdc::SCHEME_BILINEAR}});
+        {{"catmark", Sdc::SCHEME_CATMARK}, {"loop", Sdc::SCHEME_LOOP}});
     O options;
     options.SetVtxBoundaryInterpolation(a.choice<O::VtxBoundaryInterpolation>("boundary", "edge_and_corner",
         {{"none", O::VTX_BOUNDARY_NONE}, {"edge_only", O::VTX_BOUNDARY_EDGE_ONLY},
@@ -102,26 +94,20 @@ static std::unique_ptr<Refiner> make_refiner(const Cage &cage, const Arguments &
     return refiner;
 }
 
-// Rows of all levels, one after the other.
-template <class R> std::vector<R> refined(const Refiner &refiner, const Cage &cage, int local_points) {
-    auto data = rows_for<R>(cage.values, cage.width, refiner.GetNumVerticesTotal() + local_points);
+// Rows of all levels, one after the other: of vertices, or of face-varying values.
+template <class R> std::vector<R> refined(const Refiner &refiner, const Cage &cage, bool is_fvar, int local_points) {
+    int width = is_fvar ? cage.fvar_width : cage.width;
+    int total = is_fvar ? refiner.GetNumFVarValuesTotal() : refiner.GetNumVerticesTotal();
+    const auto &values = is_fvar ? cage.fvar_values : cage.values;
+    std::vector<R> data(values.begin(), values.end());
+    data.resize(size_t(width) * (total + local_points));
     Far::PrimvarRefinerReal<R> primvars(refiner);
-    Rows<R> source(cage.width, data.data());
+    Rows<R> source(width, data.data());
     for (int level = 1; level <= refiner.GetMaxLevel(); ++level) {
-        Rows<R> next = source.from(refiner.GetLevel(level - 1).GetNumVertices());
-        primvars.Interpolate(level, source, next);
-        source = next;
-    }
-    return data;
-}
-
-template <class R> std::vector<R> refined_face_varying(const Refiner &refiner, const Cage &cage, int local_points) {
-    auto data = rows_for<R>(cage.fvar_values, cage.fvar_width, refiner.GetNumFVarValuesTotal() + local_points);
-    Far::PrimvarRefinerReal<R> primvars(refiner);
-    Rows<R> source(cage.fvar_width, data.data());
-    for (int level = 1; level <= refiner.GetMaxLevel(); ++level) {
-        Rows<R> next = source.from(refiner.GetLevel(level - 1).GetNumFVarValues());
-        primvars.InterpolateFaceVarying(level, source, next);
+        const auto &before = refiner.GetLevel(level - 1);
+        Rows<R> next = source.from(is_fvar ? before.GetNumFVarValues() : before.GetNumVertices());
+        if (is_fvar) primvars.InterpolateFaceVarying(level, source, next);
+        else primvars.Interpolate(level, source, next);
         source = next;
     }
     return data;
@@ -143,14 +129,14 @@ public:
         map_.reset(new Far::PatchMap(*patches_));
         ptex_.reset(new Far::PtexIndices(*refiner_));
 
-        points_ = refined<R>(*refiner_, cage, patches_->GetNumLocalPoints());
+        points_ = refined<R>(*refiner_, cage, false, patches_->GetNumLocalPoints());
         Rows<R> rows(cage.width, points_.data());
         if (patches_->GetNumLocalPoints()) {
             Rows<R> local = rows.from(refiner_->GetNumVerticesTotal());
             patches_->template GetLocalPointStencilTable<R>()->UpdateValues(rows, local);
         }
         if (!cage.fvar_width) return;
-        fvar_points_ = refined_face_varying<R>(*refiner_, cage, patches_->GetNumLocalPointsFaceVarying());
+        fvar_points_ = refined<R>(*refiner_, cage, true, patches_->GetNumLocalPointsFaceVarying());
         Rows<R> fvar_rows(cage.fvar_width, fvar_points_.data());
         if (patches_->GetNumLocalPointsFaceVarying()) {
             Rows<R> local = fvar_rows.from(refiner_->GetNumFVarValuesTotal());
@@ -184,61 +170,6 @@ private:
     std::unique_ptr<Far::PatchMap> map_;
     std::unique_ptr<Far::PtexIndices> ptex_;
     std::vector<R> points_, fvar_points_;
-};
-
-template <class R> class BfrSurface {
-public:
-    BfrSurface(const Cage &cage, const Arguments &a, const Queries &queries)
-        : cage_(cage), refiner_(make_refiner(cage, a)), surface_(cage.face_count()), fvar_surface_(cage.face_count()),
-          points_(cage.face_count()), fvar_points_(cage.face_count()) {
-        typename Bfr::RefinerSurfaceFactory<>::Options options;
-        options.SetApproxLevelSmooth(a.number("level", 2)).SetApproxLevelSharp(std::max(a.number("level", 2), 6));
-        Bfr::RefinerSurfaceFactory<> factory(*refiner_, options);
-        std::vector<R> values(cage.values.begin(), cage.values.end());
-        std::vector<R> fvar_values(cage.fvar_values.begin(), cage.fvar_values.end());
-        std::vector<char> asked(cage.face_count(), 0);
-        for (int f : queries.face) {
-            if (asked[f]) continue;
-            asked[f] = 1;
-            if (factory.InitVertexSurface(f, &surface_[f])) {
-                points_[f].resize(size_t(surface_[f].GetNumPatchPoints()) * cage.width);
-                surface_[f].PreparePatchPoints(values.data(), cage.width, points_[f].data(), cage.width);
-            }
-            if (cage.fvar_width && factory.InitFaceVaryingSurface(f, &fvar_surface_[f], 0)) {
-                fvar_points_[f].resize(size_t(fvar_surface_[f].GetNumPatchPoints()) * cage.fvar_width);
-                fvar_surface_[f].PreparePatchPoints(fvar_values.data(), cage.fvar_width, fvar_points_[f].data(),
-                                                    cage.fvar_width);
-            }
-        }
-    }
-
-    void answer(const Queries &queries, int i, Answers &answers) {
-        const int f = queries.face[i], w = cage_.width;
-        if (points_[f].empty()) return;
-        R uv[2] = {R(queries.uv[2 * i]), R(queries.uv[2 * i + 1])}, out[3][64];
-        double scale = 1;
-        auto parameters = surface_[f].GetParameterization();
-        if (parameters.HasSubFaces()) {
-            R on_sub_face[2] = {uv[0], uv[1]};
-            parameters.ConvertNormalizedSubFaceToCoord(queries.sub[i], on_sub_face, uv);
-            scale = 0.5;   // as for Far
-        }
-        surface_[f].Evaluate(uv, points_[f].data(), w, out[0], out[1], out[2]);
-        for (int k = 0; k < w; ++k) {
-            answers.p[size_t(i) * w + k] = out[0][k];
-            answers.du[size_t(i) * w + k] = scale * out[1][k];
-            answers.dv[size_t(i) * w + k] = scale * out[2][k];
-        }
-        if (fvar_points_[f].empty()) return;
-        fvar_surface_[f].Evaluate(uv, fvar_points_[f].data(), cage_.fvar_width, out[0]);
-        std::copy(out[0], out[0] + cage_.fvar_width, &answers.fvar[size_t(i) * cage_.fvar_width]);
-    }
-
-private:
-    const Cage &cage_;
-    std::unique_ptr<Refiner> refiner_;
-    std::vector<Bfr::Surface<R>> surface_, fvar_surface_;
-    std::vector<std::vector<R>> points_, fvar_points_;
 };
 
 // Faces of a level with what they are a part of: a face of the cage or a polygon's sub-face, and their corners' (u, v)
@@ -313,7 +244,7 @@ public:
             }
         }
 
-        auto points = refined<R>(*refiner_, cage, 0);
+        auto points = refined<R>(*refiner_, cage, false, 0);
         int before = refiner_->GetNumVerticesTotal() - level.GetNumVertices();
         Rows<R> source = Rows<R>(cage.width, points.data()).from(before);
         for (auto *values : {&p_, &du_, &dv_}) values->resize(size_t(level.GetNumVertices()) * cage.width);
@@ -321,7 +252,7 @@ public:
         Far::PrimvarRefinerReal<R> primvars(*refiner_);
         primvars.Limit(source, p, du, dv);
         if (!cage.fvar_width) return;
-        auto fvar = refined_face_varying<R>(*refiner_, cage, 0);
+        auto fvar = refined<R>(*refiner_, cage, true, 0);
         before = refiner_->GetNumFVarValuesTotal() - level.GetNumFVarValues();
         Rows<R> fvar_source = Rows<R>(cage.fvar_width, fvar.data()).from(before);
         fvar_.resize(size_t(level.GetNumFVarValues()) * cage.fvar_width);
@@ -362,7 +293,6 @@ private:
 template <class R> void run_in(const Arguments &a, const Cage &cage, const Queries &queries, Answers &answers) {
     std::string method = a.text("method", "far");
     if (method == "far") run<FarSurface<R>>(a, cage, queries, answers);
-    else if (method == "bfr") run<BfrSurface<R>>(a, cage, queries, answers);
     else if (method == "refine") run<RefinedSurface<R>>(a, cage, queries, answers);
     else fail("unknown --method " + method);
 }

@@ -25,7 +25,7 @@ SOURCES = [Path(__file__).with_name(name) for name in ("osd_peer.cpp", "peer_com
 # The answers take milliseconds, and compiling OpenSubdiv's headers with -O3 three times as long as with -O1.
 FLAGS = ["-std=c++17", "-O1", "-DNDEBUG", "-pthread"]
 # Corners of a face that has one domain.
-REGULAR_SIZE = {"catmark": 4, "bilinear": 4, "loop": 3}
+REGULAR_SIZE = {"catmark": 4, "loop": 3}
 LEVELS = {"far": 10, "refine": 6}
 
 
@@ -72,7 +72,7 @@ class PeerCage:
 
     positions: ArrayLike  # (n_v, 3)
     faces: Sequence[Sequence[int]]
-    scheme: str = "catmark"  # | "loop" | "bilinear"
+    scheme: str = "catmark"  # | "loop"
     boundary: str = "edge_and_corner"  # | "edge_only" | "none"
     creases: Sequence[tuple[int, int, float]] = ()  # (vertex, vertex, sharpness)
     corners: Sequence[tuple[int, float]] = ()  # (vertex, sharpness)
@@ -112,7 +112,6 @@ def evaluate(
     *,
     method: str = "far",
     level: int | None = None,
-    real: str = "double",
 ) -> PeerSamples:
     """Samples of a cage's limit surface; ``element``, ``uv`` and ``corner`` as for `LimitSurface.evaluate`.
 
@@ -147,7 +146,7 @@ def evaluate(
         "sub": np.where(is_whole, 0, corner).astype(np.int32),
         "uv": turned,
     }
-    options = {"method": method, "level": LEVELS[method] if level is None else level, "real": real}
+    options = {"method": method, "level": LEVELS[method] if level is None else level}
     options |= {"scheme": cage.scheme, "boundary": cage.boundary, "creasing": cage.creasing}
     options |= {"triangles": cage.triangles, "fvar": cage.fvar_linear}
     with tempfile.TemporaryDirectory() as folder:
