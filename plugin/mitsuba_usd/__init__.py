@@ -10,8 +10,8 @@ surface_models.py            models of surfaces, by the inputs that all share
 materialx_nodes.py, materialx_noise.py   nodes of MaterialX, evaluated to numbers or pictures
 copies.py                    replaces many instances by meshes
 picture_detail.py            triangles and pixels of textures that a picture needs
-bsdfs.py, textures.py, texture_image.py, emitters.py, sensors.py, shapes.py   build scene entries from the data
-scene_entries.py             combines the entries, for one scene or for frames
+bsdfs.py, textures.py, texture_image.py, emitters.py, sensors.py   build scene entries from the data
+scene_entries.py             shapes, and all entries, for one scene or for frames
 stage_scenes.py              all of it, at one time or in frames
 """
 

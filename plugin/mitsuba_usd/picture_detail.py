@@ -25,7 +25,7 @@ from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
 from .contents import NodeContents, SceneContents, ShapeContents, TextureContents, leaves
-from .shapes import Surfaces
+from .scene_entries import Surfaces
 from .textures import samples_elsewhere
 
 # Texels for each pixel: filters see details of half a pixel, and glass magnifies.

@@ -1,25 +1,57 @@
-"""Shapes, materials, instances and lights of a stage as entries of a scene."""
+"""Shapes, materials, instances and lights of a stage as entries of a scene.
+
+Limit surfaces become the shape ``subdivision``, polygons meshes: entries, or objects that are kept from frame to frame.
+Cages that are equal share one limit surface.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from functools import partial
+import warnings
+import zlib
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import mitsuba as mi
-from mitsuba_subdivision.cage import CageError
+import numpy as np
+from mitsuba_subdivision.cage import (
+    Attribute,
+    CageContents,
+    CageError,
+    CageWarning,
+    ControlCage,
+    noting_warnings,
+    same,
+    same_topology,
+    without_warnings,
+)
+from mitsuba_subdivision.mesh import IntArray, ragged
 from mitsuba_subdivision.messages import counted
+from mitsuba_subdivision.mitsuba_mesh import PolygonMesh, box_corners, points_at
 from mitsuba_subdivision.schemes import SchemeError
+from mitsuba_subdivision.studio import frame_table, set_parameters
+from mitsuba_subdivision.surface import LimitSurface
 from mitsuba_subdivision.variants import SceneNode
+from numpy.typing import NDArray
 
 from .bsdfs import bsdf, interior, radiance, rgb
 from .contents import MaterialContents, SceneContents, ShapeContents
 from .emitters import emitter, one_environment
 from .sensors import RESERVED
-from .shapes import LoadedShapes, Surfaces, as_polygons, polygon_mesh, subdivision
 from .stage_warnings import StageWarnings
 from .textures import Textures
+
+# From so many faces on, control points stand for the surface, which lies among them and near them: a sphere with 64
+# faces around is smaller than its cage by a six-hundredth of its radius.
+DENSE = 2_000
+_NO_POINTS: NDArray[np.float64] = np.zeros((0, 3))
+# Fields of a shape that may differ between frames that share an object: a shape can move, and materials are compared
+# themselves.
+_MOVABLE = frozenset({"cage", "to_world", "material"})
+Loaded = tuple[ShapeContents, MaterialContents | None, mi.Object]
 
 
 def scene_entries(
@@ -106,3 +138,243 @@ def scene_entries(
         is_clear = has_clear_lamps and "emitter" in entry
         add(light.name, {**entry, "bsdf": {"type": "null"}} if is_clear else entry)
     return scene
+
+
+@dataclass(frozen=True, eq=False)
+class CachedSurface:
+    """A limit surface with the warnings about its cage."""
+
+    contents: CageContents
+    surface: LimitSurface
+    warnings: list[str]
+
+    @cached_property
+    def properties(self) -> SceneNode:
+        """Properties of the shape ``subdivision`` that describe the cage."""
+        return self.surface.cage.as_properties(mi)
+
+    @cached_property
+    def points(self) -> NDArray[np.float64]:
+        return self.points_of(self.surface.cage.positions)
+
+    def points_of(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points on or around the surface of these control points."""
+        return positions[self._used] if self._frame_table is None else self._frame_table.apply(positions)[0]
+
+    @cached_property
+    def _frame_table(self) -> Any:
+        return frame_table(self.surface) if self.surface.cage.face_count < DENSE else None
+
+    @cached_property
+    def _used(self) -> NDArray[np.bool_]:
+        """Mask of the vertices of faces that are not holes."""
+        cage = self.surface.cage
+        is_hole = np.isin(np.arange(cage.face_count), cage.holes)
+        return np.isin(np.arange(cage.vertex_count), cage.face_vertices[np.repeat(~is_hole, cage.face_sizes)])
+
+
+class Surfaces:
+    """Caches limit surfaces: the left and the right bishop, black or white, share one."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[int, ...], list[CachedSurface]] = {}
+        # Of shapes whose control points may be others at other times.
+        self._of_shape: dict[tuple[str, int | None], CachedSurface] = {}
+
+    def of(self, contents: CageContents) -> CachedSurface:
+        """The surface of a cage, without warnings.
+
+        Raises CageError if the cage is invalid. Raises SchemeError if the scheme cannot subdivide it.
+        """
+        key = len(contents.positions), len(contents.face_sizes), zlib.crc32(contents.positions.tobytes())
+        alike = self._known.setdefault(key, [])
+        for known in alike:
+            if same(known.contents, contents):
+                return known
+        with noting_warnings() as messages, without_warnings():
+            surface = LimitSurface(ControlCage.from_arrays(**contents.as_arguments()))
+        alike.append(CachedSurface(contents, surface, messages))
+        return alike[-1]
+
+    def points(self, contents: SceneContents) -> NDArray[np.float64]:
+        """Points ``(n, 3)`` in the world, all over limit surfaces or around them, and corners of polygons.
+
+        Of groups, there are the corners of their boxes. Where only control points differ from those of an earlier
+        call, weights are made once.
+        """
+        of_shapes = [self._points_of(shape) for shape in counted(contents.shapes, "Limit surfaces")]
+        boxes = []
+        for group in contents.groups:
+            inside = np.concatenate([_NO_POINTS, *map(self._points_of, group)])
+            boxes.append(box_corners(np.stack([inside.min(axis=0), inside.max(axis=0)])) if len(inside) else inside)
+        of_instances = [points_at(boxes[instance.group], instance.to_world) for instance in contents.instances]
+        points = np.concatenate([_NO_POINTS, *of_shapes, *of_instances])
+        return np.asarray(points[np.isfinite(points).all(axis=1)])
+
+    def _points_of(self, shape: ShapeContents) -> NDArray[np.float64]:
+        cage, key = shape.cage, (shape.name, shape.material)
+        if cage.scheme is None:
+            return points_at(cage.positions, shape.to_world)
+        known = self._of_shape.get(key)
+        if known is None or not same_topology(known.contents, cage):
+            try:
+                known = self._of_shape[key] = self.of(cage)
+            except SchemeError:
+                # Shown as polygons.
+                return points_at(cage.positions, shape.to_world)
+            except CageError:
+                # Entries are made of it later, with the error.
+                return _NO_POINTS
+        is_same = np.array_equal(known.contents.positions, cage.positions)
+        points = known.points if is_same else known.points_of(np.asarray(cage.positions, dtype=np.float64))
+        return points_at(points, shape.to_world)
+
+
+def subdivision(
+    shape: ShapeContents,
+    surfaces: Surfaces,
+    bsdf: SceneNode,
+    emitter: SceneNode | None,
+    parameters: dict[str, Any],  # Of the shape `subdivision`
+    notes: StageWarnings,
+) -> SceneNode:
+    """A limit surface. Raises CageError for an invalid cage, SchemeError if the scheme cannot subdivide it."""
+    # Validated here, so that messages name the prim.
+    surface = surfaces.of(shape.cage)
+    for message in surface.warnings:
+        notes.add_message(message.replace(surface.contents.source.name, shape.cage.source.name), shape.name)
+    # Any, as the stubs call it an object.
+    tensor: Any = mi.TensorXu
+    shown = shape.shown_faces
+    return {
+        "type": "subdivision",
+        **surface.properties,
+        "cage_name": shape.cage.source.name,
+        **({} if shown is None else {"shown_faces": tensor(shown.astype(np.uint32))}),
+        **parameters,
+        "to_world": mi.ScalarTransform4f(shape.to_world.tolist()),
+        "bsdf": bsdf,
+        **({} if emitter is None else {"emitter": emitter}),
+    }
+
+
+def as_polygons(shape: ShapeContents) -> ShapeContents:
+    """A limit surface as its control cage."""
+    cage, shown = shape.cage, shape.shown_faces
+    if shown is not None:
+        cage = replace(cage, holes=np.union1d(cage.holes, np.setdiff1d(np.arange(len(cage.face_sizes)), shown)))
+    return replace(shape, cage=replace(cage, scheme=None), shown_faces=None)
+
+
+def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
+    """Triangles of a shape that is not to be subdivided."""
+    cage, normals = shape.cage, shape.normals
+    corners = _triangles(cage)
+    data: dict[str, Attribute] = dict(cage.attributes)
+    if cage.texcoords is not None:
+        data["texcoords"] = cage.texcoords
+    if normals is not None or any(attribute.interpolation == "face_varying" for attribute in data.values()):
+        # Every corner of a face is a vertex of its own.
+        vertex, triangles = cage.face_vertices, corners
+    else:
+        vertex, triangles = np.arange(len(cage.positions)), cage.face_vertices[corners]
+    matrix = shape.to_world
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        triangles = triangles[:, ::-1]
+    vertices: dict[str, NDArray] = {"vertex_positions": points_at(cage.positions[vertex], matrix)}
+    if normals is not None:
+        turned = normals @ np.linalg.inv(matrix[:3, :3])
+        lengths = np.linalg.norm(turned, axis=1, keepdims=True)
+        vertices["vertex_normals"] = turned / np.where(lengths > 0, lengths, 1)
+    for name, attribute in data.items():
+        vertices[f"vertex_{name}"] = attribute.values[vertex if attribute.indices is None else attribute.indices]
+    return PolygonMesh(shape.name, triangles, vertices)
+
+
+def _triangles(cage: CageContents) -> IntArray:
+    """Face corners of triangles that fan out from the first corners of the faces, ``(n, 3)``."""
+    sizes = cage.face_sizes.copy()
+    first = np.cumsum(sizes) - sizes
+    sizes[cage.holes] = 0
+    counts = np.maximum(sizes - 2, 0)
+    second = ragged.ranges(first + 1, counts)
+    return np.stack([np.repeat(first, counts), second, second + 1], axis=1)
+
+
+class LoadedShapes:
+    """Objects of shapes in successive frames.
+
+    A limit surface that only moves reuses the object of the frame before, with new control points: its patches and
+    weights stay. A polygon mesh that moves is rebuilt.
+    """
+
+    def __init__(self) -> None:
+        self._before: dict[tuple[str, int], Loaded] = {}
+        self._now: dict[tuple[str, int], Loaded] = {}
+        self._counts: Counter[str] = Counter()
+        self._bsdfs: list[tuple[MaterialContents, mi.BSDF]] = []
+
+    def begin_frame(self) -> None:
+        """Begin the next frame, and free objects that the last one did not use."""
+        self._before, self._now, self._counts = self._now, {}, Counter()
+        materials = [material for _, material, _ in self._before.values()]
+        self._bsdfs = [pair for pair in self._bsdfs if any(pair[0] is material for material in materials)]
+
+    def object_of(
+        self,
+        shape: ShapeContents,
+        material: MaterialContents | None,
+        entry: Callable[[SceneNode], SceneNode],  # Makes the entry of the shape with a BSDF
+        bsdf: Callable[[], SceneNode],  # Makes the entry of its BSDF
+    ) -> mi.Object:
+        """The object of a shape.
+
+        Raises CageError if the cage is invalid, or its points are not finite. Raises SchemeError if the scheme cannot
+        subdivide it.
+        """
+        # Several shapes have one name if a mesh has several materials, or if groups have equal shapes.
+        self._counts[shape.name] += 1
+        key = shape.name, self._counts[shape.name]
+        known = self._before.get(key)
+        is_there = (
+            known is not None
+            and np.array_equal(known[0].to_world, shape.to_world)
+            and np.array_equal(known[0].cage.positions, shape.cage.positions)
+        )
+        if (
+            known is None
+            or not (same(known[0], shape, _MOVABLE) and same(known[1], material))
+            or not same_topology(known[0].cage, shape.cage)
+            or (shape.cage.scheme is None and not is_there)
+        ):
+            known = shape, material, self._loaded(material, entry, bsdf)
+        elif not is_there:
+            positions = np.asarray(shape.cage.positions, dtype=np.float64)
+            if not np.isfinite(positions).all():
+                raise CageError(f"{shape.cage.source.name}: points are not finite; expected finite numbers")
+            to_world = mi.ScalarTransform4f(shape.to_world.tolist())
+            set_parameters(known[2], {"control_points": positions, "to_world": to_world})
+            known = shape, known[1], known[2]
+        self._now[key] = known
+        return known[2]
+
+    def _loaded(
+        self,
+        material: MaterialContents | None,
+        entry: Callable[[SceneNode], SceneNode],
+        bsdf: Callable[[], SceneNode],
+    ) -> mi.Object:
+        # The cage is validated before the BSDF is made, so that warnings name the prim.
+        made = entry({})
+        # Shared by all shapes of a material, unless it reads their attributes.
+        alike = (loaded for known, loaded in self._bsdfs if same(known, material))
+        loaded = None if material is None or material.primvars() else next(alike, None)
+        if loaded is None:
+            loaded = mi.load_dict(bsdf())
+            self._bsdfs += [] if material is None or material.primvars() else [(material, loaded)]
+        if "mesh" in made:
+            parts = (mi.load_dict(made[name]) if name in made else None for name in ("emitter", "interior"))
+            return made["mesh"].loaded(loaded, *parts)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", CageWarning)
+            return mi.load_dict({**made, "bsdf": loaded})

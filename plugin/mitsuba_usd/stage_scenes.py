@@ -38,9 +38,8 @@ from numpy.typing import NDArray
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
 from .picture_detail import is_chosen, segments_of, texels_for_pictures, triangles_for_picture, with_rate
-from .scene_entries import scene_entries
+from .scene_entries import LoadedShapes, Surfaces, scene_entries
 from .sensors import NO_BLUR, angles_for, sensor, size_for, with_studio_defaults
-from .shapes import LoadedShapes, Surfaces
 from .stage_warnings import StageWarnings
 from .textures import Textures
 

@@ -18,7 +18,7 @@ from mitsuba_usd import copies
 from mitsuba_usd.contents import InstanceContents, SceneContents, ShapeContents
 from mitsuba_usd.copies import LARGE, LEAST_INSTANCES, with_copies, with_large_copies
 from mitsuba_usd.picture_detail import segments_of, triangles_for_picture
-from mitsuba_usd.shapes import DENSE, Surfaces, subdivision
+from mitsuba_usd.scene_entries import DENSE, Surfaces, subdivision
 from mitsuba_usd.stage_warnings import StageWarnings
 from usd.sensors import FOV, WIDTH, sensor_at
 

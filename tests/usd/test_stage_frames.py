@@ -16,7 +16,7 @@ from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turnt
 from mitsuba_subdivision.studio.saving import save_scene
 from mitsuba_subdivision.studio.studio_entries import Look
 from mitsuba_usd import scene_entries, stage_scenes
-from mitsuba_usd.shapes import Surfaces
+from mitsuba_usd.scene_entries import Surfaces
 from mitsuba_usd.stage_scenes import StageScenes
 from mitsuba_usd.stage_walk import StageReader, _StageWalk, is_still
 from usd.moving_stages import BARE, CAMERA, FLOOR, INSTANCES, LAMP, LAMP_MOVES, MOVING, STILL, WHOLE, placed, write
