@@ -1,6 +1,7 @@
 """Every figure draws, and the numbers in them are those of the surfaces."""
 
 import hashlib
+import json
 import re
 from functools import partial
 from pathlib import Path
@@ -210,13 +211,13 @@ def no_programs(monkeypatch, tmp_path):
 def answering(tmp_path):
     """Function that writes a program of the shell, and returns its path.
 
-    With records to answer, it copies what it is asked to a file `asked`.
+    With data to answer, it copies what it is asked to a file `asked`.
     """
 
-    def write(name, text, **records):
+    def write(name, text, answers=None):
         program = tmp_path / name
-        if records:
-            peers.write_records(tmp_path / "answers", {key: np.array(values) for key, values in records.items()})
+        if answers is not None:
+            (tmp_path / "answers").write_bytes(answers)
             text += f'\ncp "$1" {tmp_path}/asked; cp {tmp_path}/answers "$2"'
         program.write_text(f"#!/bin/sh\n{text}\n")
         program.chmod(0o755)
@@ -358,12 +359,13 @@ def test_a_failing_program_says_why(answering):
 @pytest.mark.posix
 def test_samples_of_opensubdiv_are_those_it_answers(tmp_path, answering):
     answers = {"p": [1.0, 2, 3, 4, 5, 6], "du": [2.0, 0, 0, 0, 0, 0], "dv": [0, 3.0, 0, 1, 0, 0]}
-    program = answering("osd_peer", "", **answers)
+    answers = peers.as_bytes({name: np.array(values) for name, values in answers.items()})
+    program = answering("osd_peer", "", answers)
     points, normals = peers.osd_samples(program, cube(), 3, [[0.5, 0.25], [1, 0]], "far", 2)
     assert np.array_equal(points, [[1, 2, 3], [4, 5, 6]])
     # Where a derivative vanishes there is no normal.
     assert np.array_equal(normals, [[0, 0, 1], [np.nan] * 3], equal_nan=True)
-    asked = peers.read_records(tmp_path / "asked")
+    asked = peers.from_bytes((tmp_path / "asked").read_bytes())
     assert np.array_equal(asked["face"], [3, 3])
     assert np.array_equal(asked["uv"], [0.5, 0.25, 1, 0])
     assert np.array_equal(asked["values"], cube().positions.ravel())
@@ -371,19 +373,19 @@ def test_samples_of_opensubdiv_are_those_it_answers(tmp_path, answering):
 
 @pytest.mark.posix
 def test_the_mesh_of_blender_is_the_one_it_answers(tmp_path, answering):
-    points, normals, quad = np.arange(12.0), np.tile([0.0, 0, 1], 4), np.arange(4, dtype=np.int32)
-    answers = {"p": points, "n": normals, "corners": quad, "version": np.array([3, 4, 1], dtype=np.int32)}
+    points, normals = np.arange(12.0), np.tile([0.0, 0, 1], 4)
+    answers = {"p": points.tolist(), "n": normals.tolist(), "corners": [0, 1, 2, 3], "version": [3, 4, 1]}
     # The last three words are both files and the level.
     said = f'while [ $# -gt 3 ]; do echo "$1"; shift; done > {tmp_path}/words; echo "$3" >> {tmp_path}/words'
-    result = peers.blender_mesh(answering("blender", said, **answers), cube(), 5)
+    result = peers.blender_mesh(answering("blender", said, json.dumps(answers).encode()), cube(), 5)
     assert np.array_equal(result[0], points.reshape(4, 3))
     assert np.array_equal(result[1], normals.reshape(4, 3))
     assert (result[2].tolist(), result[3]) == ([[0, 1, 2, 3]], "3.4")
     words = (tmp_path / "words").read_text().split()
     assert "--background" in words
     assert words[-3:] == [str(peers.BLENDER_SCRIPT), "--", "5"]
-    asked = peers.read_records(tmp_path / "asked")
-    assert np.array_equal(asked["values"], cube().positions.ravel())
+    asked = json.loads((tmp_path / "asked").read_text())
+    assert np.array_equal(asked["positions"], cube().positions)
     assert np.array_equal(asked["corners"], cube().face_vertices)
 
 

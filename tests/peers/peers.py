@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from mitsuba_subdivision.figures.peers import read_records, write_records
+from mitsuba_subdivision.figures.peers import as_bytes, from_bytes
 from numpy.typing import ArrayLike, NDArray
 
 SOURCES = [Path(__file__).with_name(name) for name in ("osd_peer.cpp", "peer_common.h")]
@@ -151,12 +151,12 @@ def evaluate(
     options |= {"triangles": cage.triangles, "fvar": cage.fvar_linear}
     with tempfile.TemporaryDirectory() as folder:
         queries, answers = Path(folder, "queries"), Path(folder, "answers")
-        write_records(queries, records)
+        queries.write_bytes(as_bytes(records))
         words = [word for name, value in options.items() for word in (f"--{name}", str(value))]
         done = subprocess.run([program, queries, answers, *words], capture_output=True, text=True, check=False)
         if done.returncode:
             raise PeerError(f"{program.name} fails: {done.stderr.strip() or done.returncode}")
-        answer = read_records(answers)
+        answer = from_bytes(answers.read_bytes())
     p, du, dv = (answer[name].reshape(-1, 3) for name in ("p", "du", "dv"))
     if method != "refine":
         du, dv = (back[:, i, :1] * du + back[:, i, 1:] * dv for i in (0, 1))

@@ -6,6 +6,7 @@ leave out its surface.
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -58,23 +59,21 @@ def osd_samples(
     Returns points, normals, (s, 3): unit normals, not a number where derivatives are parallel or vanish.
     """
     element, u, v = np.broadcast_arrays(element, np.asarray(uv)[..., 0], np.asarray(uv)[..., 1])
-    records = {
+    records: dict[str, NDArray] = {
         "widths": np.array([3, 0], dtype=np.int32),
-        **_records_of(cage),
+        "values": cage.positions,
+        "sizes": cage.face_sizes.astype(np.int32),
+        "corners": cage.face_vertices.astype(np.int32),
         "face": element.astype(np.int32),
         "sub": np.zeros(element.size, dtype=np.int32),
         "uv": np.stack([u, v], axis=-1).astype(np.float64),
     }
-    answers = _answers(program, [], records, ["--method", method, "--level", str(level), "--real", "float"])
+    options = ["--method", method, "--level", str(level), "--real", "float"]
+    answers = from_bytes(_answer(program, [], as_bytes(records), options))
     points, along_u, along_v = (answers[name].reshape(-1, 3) for name in ("p", "du", "dv"))
     cross = np.cross(along_u, along_v)
     with np.errstate(invalid="ignore"):
         return points, cross / np.linalg.norm(cross, axis=1, keepdims=True)
-
-
-def _records_of(cage: ControlCage) -> dict[str, NDArray]:
-    sizes, corners = cage.face_sizes.astype(np.int32), cage.face_vertices.astype(np.int32)
-    return {"values": cage.positions, "sizes": sizes, "corners": corners}
 
 
 def blender_mesh(
@@ -90,37 +89,40 @@ def blender_mesh(
     # Several threads race for the last bits of points that faces share.
     options = ["--threads", "1", "--background", "--factory-startup", "--python-exit-code", "1"]
     options += ["--python", str(BLENDER_SCRIPT), "--"]
-    answers = _answers(program, options, _records_of(cage), [str(level)])
-    version = ".".join(map(str, answers["version"][:2]))
-    points, normals = (answers[name].reshape(-1, 3) for name in ("p", "n"))
-    return points, normals, answers["corners"].reshape(-1, 4), version
+    arrays = {"positions": cage.positions, "sizes": cage.face_sizes, "corners": cage.face_vertices}
+    query = json.dumps({name: values.tolist() for name, values in arrays.items()})
+    answers = json.loads(_answer(program, options, query.encode(), [str(level)]))
+    points, normals = (np.array(answers[name]).reshape(-1, 3) for name in ("p", "n"))
+    quads = np.array(answers["corners"], dtype=np.int32).reshape(-1, 4)
+    return points, normals, quads, "{}.{}".format(*answers["version"])
 
 
-def _answers(program: Path, before: list[str], records: dict[str, NDArray], after: list[str]) -> dict[str, NDArray]:
-    """Run a program on records, with words before and after the names of the two files; returns its answers."""
+def _answer(program: Path, before: list[str], query: bytes, after: list[str]) -> bytes:
+    """Run a program on the contents of a file, with words before and after the names of the two files."""
     with tempfile.TemporaryDirectory() as folder:
         queries, answers = Path(folder, "queries"), Path(folder, "answers")
-        write_records(queries, records)
+        queries.write_bytes(query)
         done = subprocess.run([program, *before, queries, answers, *after], capture_output=True, text=True, check=False)
         # Blender may exit with 0 although its script failed.
         if done.returncode or not answers.exists():
             raise FigureError(f"{program} fails: {done.stderr.strip() or done.returncode}")
-        return read_records(answers)
+        return answers.read_bytes()
 
 
-def write_records(path: Path, records: Mapping[str, NDArray]) -> None:
-    """Write arrays of int32 and float64, as the peers' programs read them (``peer_common.h``)."""
-    with path.open("wb") as file:
-        for name, values in records.items():
-            kind = b"i" if values.dtype == np.int32 else b"d"
-            file.write(name.encode().ljust(16, b"\0") + kind.ljust(8, b"\0") + np.int64(values.size).tobytes())
-            file.write(values.tobytes())
+def as_bytes(records: Mapping[str, NDArray]) -> bytes:
+    """Arrays of int32 and float64, as the peers' programs read them (``peer_common.h``)."""
+    data = b""
+    for name, values in records.items():
+        kind = b"i" if values.dtype == np.int32 else b"d"
+        data += name.encode().ljust(16, b"\0") + kind.ljust(8, b"\0") + np.int64(values.size).tobytes()
+        data += values.tobytes()
+    return data
 
 
-def read_records(path: Path) -> dict[str, NDArray]:
-    """Read what `write_records` or a peer's program wrote."""
-    data, at = path.read_bytes(), 0
+def from_bytes(data: bytes) -> dict[str, NDArray]:
+    """Arrays that `as_bytes` or a peer's program wrote."""
     records: dict[str, NDArray] = {}
+    at = 0
     while at < len(data):
         name, kind = data[at : at + 16].rstrip(b"\0").decode(), data[at + 16 : at + 17]
         count = int(np.frombuffer(data, np.int64, 1, at + 24)[0])
