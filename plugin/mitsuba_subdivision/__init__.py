@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from .refinement.cage_refinement import CageRefinement
     from .schemes import SchemeError
     from .shapes.derivatives import loss_of_views
-    from .shapes.tessellation_parameters import pixel_error_for
+    from .shapes.parameters import pixel_error_for
     from .studio import render_denoised, studio_scene
     from .surface import LimitSurface, SurfaceSamples
     from .tessellation.vertex_table import Tessellation, VertexMatrices
@@ -76,7 +76,7 @@ _NAMES = {
     "refinement.cage_refinement": ("CageRefinement",),
     "schemes": ("SchemeError", "register_scheme"),
     "shapes.derivatives": ("loss_of_views",),
-    "shapes.tessellation_parameters": ("pixel_error_for",),
+    "shapes.parameters": ("pixel_error_for",),
     "studio": ("render_denoised", "studio_scene"),
     "surface": ("LimitSurface", "SurfaceSamples"),
     "tessellation.vertex_table": ("Tessellation", "VertexMatrices"),

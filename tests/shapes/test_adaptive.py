@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface, pixel_error_for, upload
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.shapes.tessellation_parameters import sensor_in_world
+from mitsuba_subdivision.shapes.parameters import sensor_in_world
 from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
 from patches.closed_cages import bumpy
 from reference.refined_cages import tagged

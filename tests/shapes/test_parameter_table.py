@@ -8,8 +8,7 @@ import pytest
 from mitsuba_subdivision.cage.contents import RULES
 from mitsuba_subdivision.shapes import register_variant
 from mitsuba_subdivision.shapes.parameter_table import PARAMETER_OF_NAME, PARAMETERS, STATE_PARAMETERS
-from mitsuba_subdivision.shapes.parameters import is_attribute_parameter
-from mitsuba_subdivision.shapes.tessellation_parameters import LIMITS
+from mitsuba_subdivision.shapes.parameters import LIMITS, is_attribute_parameter
 from mitsuba_subdivision.tessellation import HIGHEST_RATE
 from shapes.cages import cube, load
 from shapes.variants import every_variant

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .. import example_file
 from ..device_arrays import upload
 from ..mitsuba_mesh import mitsuba_mesh
-from ..shapes.tessellation_parameters import pixel_error_for
+from ..shapes.parameters import pixel_error_for
 from ..tessellation import HIGHEST_RATE
 from ..variants import SceneNode
 from .output import FigureOptions, panels, write_figure

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import time as clock
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import blake2b
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import mitsuba as mi
@@ -26,7 +26,10 @@ from ..surface import TEXCOORDS, LimitSurface
 from .cage_attributes import RESERVED
 from .parameter_table import PARAMETER_OF_NAME, errors_about, value_of
 from .placement import checked_matrix
-from .tessellation_parameters import Tessellation, read_tessellation
+
+if TYPE_CHECKING:
+    from ..tessellation.criterion import DisplacementBound, Sensor
+    from ..tessellation.vertex_table import VertexTable
 
 TEXCOORD_INDICES = "texcoord_indices"
 # Parameters of a cage in memory, and their shapes, with -1 for any size.
@@ -34,6 +37,10 @@ ARRAYS = {"positions": (-1, 3), "face_sizes": (-1,), "face_vertices": (-1,)}
 TAGS = {"creases": (-1, 3), "corners": (-1, 2), "holes": (-1,)}
 # Parameters that select the mesh and the time code of a USD file.
 IN_FILE = ("prim", "time")
+# Parameters of the limit of an adaptive tessellation. Exactly one must be given.
+LIMITS = ("chord_error", "pixel_error", "max_edge")
+SENSOR = ("sensor_to_world", "sensor_fov", "film_width", "film_height")
+ADAPTIVE = (*LIMITS, "max_rate", *SENSOR, "outline")
 
 _OBJECTS = (mi.Properties.Type.Object, mi.Properties.Type.ResolvedReference, mi.Properties.Type.Reference)
 
@@ -43,6 +50,53 @@ SETTLED = 2_000_000_000
 _CAGES: Shared[ControlCage] = Shared()
 # Warnings that were issued when each cage was built. They are repeated for each shape.
 _WARNINGS: WeakKeyDictionary[ControlCage, list[str]] = WeakKeyDictionary()
+
+
+@dataclass(frozen=True, eq=False)
+class Tessellation:
+    """The same number of segments on every edge of the cage, or as few triangles as an error limit allows."""
+
+    rate: int  # Number of segments along an edge of the cage; the largest one of an adaptive tessellation
+    limit: str | None = None  # One of `LIMITS`; None for the same number everywhere
+    criterion: Any = None  # The `Criterion` of the limit in world space, without a displacement
+
+    def table(
+        self,
+        surface: LimitSurface,
+        control_points: NDArray,  # (n, 3) float64 in object space
+        to_world: NDArray,  # (4, 4) float64
+        # In object space. With a displacement, the limit holds everywhere, as silhouettes are unknown.
+        bound: DisplacementBound | None,
+    ) -> VertexTable:
+        """Prepare the tessellation. A uniform one does not depend on the control points."""
+        if self.limit is None:
+            return surface.sampling(self.rate)
+        criterion = self.criterion
+        if bound is not None:
+            # The spectral norm is the largest factor by which the linear map scales a length.
+            stretch, heights = float(np.linalg.norm(to_world[:3, :3], 2)), bound.heights
+            in_world = replace(bound, heights=lambda *at: stretch * heights(*at), extent=stretch * bound.extent)
+            criterion = replace(criterion, outline=None, displacement=in_world)
+        world_points = control_points @ to_world[:3, :3].T + to_world[:3, 3]
+        with errors_about(self.limit):
+            return surface.adaptive_sampling(criterion, self.rate, world_points)
+
+    def with_error(self, error: NDArray[np.floating]) -> Tessellation:
+        """Return the tessellation with another value of the limit, an array of one number.
+
+        Raises ValueError if the array has another size, or the number is not above 0.
+        """
+        if error.shape != (1,):
+            raise ValueError(f'parameter "{self.limit}" has shape {error.shape}; expected one number')
+        checked = PARAMETER_OF_NAME[str(self.limit)].checked(float(error[0]))
+        return replace(self, criterion=replace(self.criterion, error=checked))
+
+    def lines(self) -> list[str]:
+        """Lines of `to_string` that describe the tessellation."""
+        if self.limit is None:
+            return [f"tessellation_rate = {self.rate}"]
+        lines = ["tessellation = adaptive", f"{self.limit} = {self.criterion.error:.6g}", f"max_rate = {self.rate}"]
+        return lines if self.criterion.outline is None else [*lines, "outline = sensor"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +129,7 @@ def read_parameters(props: mi.Properties) -> Parameters:
     name = value_of(props, "scheme")
     with errors_about("scheme"):
         scheme = None if name is None else scheme_named(name)
-    tessellation = read_tessellation(props)
+    tessellation = _tessellation(props)
     shading, evaluator, offset = (value_of(props, name) for name in ("shading", "evaluator", "sample_offset"))
     if evaluator == "stam" and offset == 0:
         raise ValueError(f'parameter "sample_offset" is {offset}; expected a number above 0 for "evaluator" = "stam"')
@@ -136,6 +190,80 @@ def _shown(props: mi.Properties, surface: LimitSurface) -> NDArray[np.bool_] | N
     return shown
 
 
+def _tessellation(props: mi.Properties) -> Tessellation:
+    if value_of(props, "tessellation") == "uniform":
+        adaptive_only = [name for name in ADAPTIVE if name in props]
+        if adaptive_only:
+            raise ValueError(f'parameter "{adaptive_only[0]}" needs "tessellation" = "adaptive"')
+        return Tessellation(value_of(props, "tessellation_rate"))
+    if "tessellation_rate" in props:
+        raise ValueError(
+            'parameter "tessellation_rate" needs "tessellation" = "uniform"; expected "max_rate", the highest rate of '
+            "an adaptive tessellation"
+        )
+    limits = [name for name in LIMITS if name in props]
+    if len(limits) != 1:
+        raise ValueError(
+            f"an adaptive tessellation has {' and '.join(limits) or 'no limit'}; expected exactly one of "
+            f"{', '.join(LIMITS)}"
+        )
+    from ..tessellation.criterion import Criterion, Measure
+
+    (limit,) = limits
+    error, fits_outline, is_of_pixels = (
+        value_of(props, limit),
+        value_of(props, "outline") == "sensor",
+        limit == "pixel_error",
+    )
+    needed_by = "outline" if fits_outline else "pixel_error" if is_of_pixels else None
+    sensor = _sensor(props, needed_by)
+    criterion = Criterion(
+        Measure.EDGE if limit == "max_edge" else Measure.CHORD,
+        float(error),
+        sensor if is_of_pixels else None,
+        sensor if fits_outline else None,
+    )
+    return Tessellation(value_of(props, "max_rate"), limit, criterion)
+
+
+def _sensor(props: mi.Properties, needed_by: str | None) -> Sensor | None:
+    given = [name for name in SENSOR if name in props]
+    if needed_by is None:
+        if given:
+            raise ValueError(f'parameter "{given[0]}" needs "pixel_error", or "outline" = "sensor"')
+        return None
+    missing = [name for name in SENSOR if name not in props]
+    if missing:
+        raise ValueError(
+            f'parameter "{needed_by}" needs a sensor, and "{missing[0]}" is missing; expected {", ".join(SENSOR)}, as '
+            "pixel_error_for(sensor) returns them"
+        )
+    to_world = checked_matrix(props["sensor_to_world"], "sensor_to_world")
+    fov, width, height = (value_of(props, name) for name in SENSOR[1:])
+    return sensor_in_world(to_world, fov, width, height)
+
+
+def sensor_in_world(
+    to_world: NDArray[np.float64],  # (4, 4) float64: camera-to-world transformation
+    fov: float,  # Field of view along the film's width, in degrees; 0 if the sensor is orthographic
+    # Size of the film in pixels
+    width: int,
+    height: int,
+) -> Sensor:
+    """Make the sensor of error criteria."""
+    from ..tessellation.criterion import Sensor
+
+    eye, axis = to_world[:3, 3], to_world[:3, 2]
+    if not fov:
+        # The film is two units wide in camera space.
+        sizes = np.linalg.norm(to_world[:3, :2], axis=0) * 2 / width
+        return Sensor(eye, float(sizes.min()), axis / np.linalg.norm(axis))
+    # Size of a pixel at depth one. At equal distance, pixels get smaller towards the corners of the film.
+    pixel = 2 * np.tan(np.radians(fov) / 2) / width
+    corner = np.hypot(width, height) / 2 * pixel
+    return Sensor(eye, float(pixel / np.hypot(1, corner)))
+
+
 def _displacement(props: mi.Properties) -> tuple[Any, float]:
     """Heights, as a texture, a name of a mesh attribute or None, and their scale."""
     scale = value_of(props, "displacement_scale")
@@ -193,12 +321,10 @@ def _cage(props: mi.Properties, scheme: str | None) -> ControlCage:
         expected = ", ".join(f'"{name}"' for name in (missing if arrays else ARRAYS))
         raise ValueError(f'no control cage: expected "filename", or {expected}' + (" as well" if arrays else ""))
     parts = {name: _tensor(props, name, shape) for name, shape in {**ARRAYS, **TAGS}.items() if name in props}
-    return cage_of_arrays(
-        value_of(props, "cage_name"), **parts, strict=strict, **rules, **read_attributes(props, _tensor)
-    )
+    return cage_of_arrays(value_of(props, "cage_name"), **parts, strict=strict, **rules, **read_attributes(props))
 
 
-def _tensor(props: mi.Properties, name: str, shape: tuple[int, ...]) -> np.ndarray:
+def _tensor(props: mi.Properties | dict[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
     """Read a tensor and check its shape, with -1 for any size. One-dimensional tensors must contain integers."""
     value = props[name]
     if not hasattr(value, "shape"):
@@ -269,17 +395,12 @@ def _shared(key: Hashable, make: Callable[[], ControlCage]) -> ControlCage:
     return cage
 
 
-# Function of the properties, a parameter's name and a shape, with -1 for any size, which returns the tensor as an
-# array.
-Reader = Callable[[Any, str, tuple[int, ...]], NDArray]
-
-
 def is_attribute_parameter(name: str) -> bool:
     """Whether a parameter of the shape contains texture coordinates, an attribute, or their indices."""
     return name in (TEXCOORDS, TEXCOORD_INDICES) or name.startswith(tuple(f"{kind}_" for kind in INTERPOLATIONS))
 
 
-def read_attributes(props: Any, read: Reader) -> dict[str, Any]:
+def read_attributes(props: mi.Properties | dict[str, Any]) -> dict[str, Any]:
     """Read texture coordinates and attributes, and return them as options of a `ControlCage`.
 
     Raises ValueError if a parameter has a wrong shape, indices come without values, or an attribute is given twice.
@@ -305,6 +426,48 @@ def read_attributes(props: Any, read: Reader) -> dict[str, Any]:
             )
         if key in attributes:
             raise ValueError(f'parameter "{name}" gives "{key}" a second time; expected one interpolation only')
-        indices = read(props, indices_of[name], (-1,)) if indices_of[name] in names else None
-        attributes[key] = Attribute(read(props, name, (-1, 2 if key == TEXCOORDS else -1)), interpolation, indices)
+        indices = _tensor(props, indices_of[name], (-1,)) if indices_of[name] in names else None
+        attributes[key] = Attribute(_tensor(props, name, (-1, 2 if key == TEXCOORDS else -1)), interpolation, indices)
     return {"texcoords": attributes.pop(TEXCOORDS, None), "attributes": attributes}
+
+
+def pixel_error_for(sensor: mi.Sensor, pixel_error: float | None = 0.5, *, outline: bool = False) -> dict[str, Any]:
+    """Return parameters of a shape that tessellate it adaptively for a sensor.
+
+    Parameters
+    ----------
+    sensor : mi.Sensor
+        Perspective (also with a thin lens) or orthographic, loaded.
+    pixel_error : float or None
+        Largest distance of the triangles from the surface, in pixels. With None, add ``chord_error`` or ``max_edge``.
+    outline : bool
+        Apply the limit only to triangles that the sensor may see edge-on; others may have up to 8 times the error. For
+        ``shading="exact"``.
+
+    Returns
+    -------
+    dict
+        Add it to the shape's parameters: ``{"type": "subdivision", ..., **pixel_error_for(sensor)}``.
+
+    Raises
+    ------
+    ValueError
+        If the sensor is of another kind, or the error is not above 0.
+    """
+    kind = getattr(sensor, "class_name", lambda: type(sensor).__name__)()
+    options: dict[str, Any] = {"tessellation": "adaptive"}
+    if pixel_error is not None:
+        options["pixel_error"] = PARAMETER_OF_NAME["pixel_error"].checked(float(pixel_error))
+    if outline:
+        options["outline"] = "sensor"
+    parameters = mi.traverse(sensor) if isinstance(sensor, mi.Sensor) else {}
+    if "x_fov" in parameters:
+        fov = float(np.ravel(np.array(parameters["x_fov"]))[0])
+    elif "rthographic" in kind:
+        fov = 0.0
+    else:
+        raise ValueError(f"sensor {kind}; expected a loaded perspective, thinlens or orthographic sensor")
+    width, height = (int(size) for size in np.ravel(np.array(sensor.film().size())))
+    matrix = np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
+    to_world = mi.ScalarTransform4f(matrix.tolist())
+    return {**options, "sensor_to_world": to_world, "sensor_fov": fov, "film_width": width, "film_height": height}

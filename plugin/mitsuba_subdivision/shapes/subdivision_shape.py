@@ -20,10 +20,9 @@ from .cage_attributes import PREFIX, CageAttributes, mesh_attributes, mesh_name
 from .device_state import DeviceState, flat_type, is_recording, paused_collection, traversed
 from .mesh_buffers import MeshBuffers, require_control_points
 from .parameter_table import errors_about, plugin_page
-from .parameters import Parameters, read_parameters
+from .parameters import Parameters, Tessellation, read_parameters
 from .placement import Placement, checked_matrix
 from .registration import on_shallow_stack
-from .tessellation_parameters import Tessellation
 
 if TYPE_CHECKING:
     from .displacement import ShapeDisplacement
@@ -58,8 +57,8 @@ def make_subdivision(
             surface, is_exact, kind = parameters.surface, _is_exact(parameters, variant), flat_type(variant)
             self._parameters, self._tessellation = parameters, parameters.tessellation
             # The parameter of an adaptive tessellation's limit.
-            error = self._tessellation.error
-            self._error = kind([error])
+            criterion = self._tessellation.criterion
+            self._error = kind([0.0 if criterion is None else criterion.error])
             # Dr.Jit's variable indices of the mesh's buffers when they were last set, and their lengths.
             self._evaluated: dict[str, int] = {}
             self._lengths: dict[str, int] = {}

@@ -14,7 +14,7 @@ from ..mitsuba_mesh import box_corners, points_at
 from ..regression.scene import BOX, LoadedScene, SceneSource, load_scene, render_image, render_pixels
 from ..shapes.interaction_hook import exact_shading_problem
 from ..shapes.parameter_table import SHADINGS
-from ..shapes.tessellation_parameters import pixel_error_for
+from ..shapes.parameters import pixel_error_for
 from ..variants import SceneNode
 
 # Largest distance of triangles from the surface, in pixels. With exact shading only silhouettes show it. Interpolated

@@ -185,7 +185,7 @@ def _contents(entry: SceneNode) -> CageContents:
     """The cage described by properties of the shape ``subdivision``, without its scheme, which the scene keeps."""
     arrays = {key: np.array(entry[key]) for key in _ARRAYS if key in entry}
     rules = {key: entry[key] for key in RULES if key in entry}
-    data = read_attributes(entry, lambda properties, key, _shape: np.array(properties[key]))
+    data = read_attributes(entry)
     with warnings.catch_warnings():
         # These warnings were issued when the scene was made.
         warnings.simplefilter("ignore", CageWarning)
