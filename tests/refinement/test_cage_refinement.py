@@ -181,7 +181,7 @@ def test_values_without_seams_are_refined_under_doo_sabin(np_rng):
     plain = tagged(cage, texcoords=texcoords, attributes={"heat": values})
     check_refined(LimitSurface(plain, "doo_sabin"), np_rng)
     varying = tagged(cage, attributes={"heat": Attribute(values, "varying")})
-    with pytest.raises(SchemeError, match='doo_sabin has no rules for the attribute "heat"'):
+    with pytest.raises(SchemeError, match='no rules for linear interpolation, as of the attribute "heat"'):
         varying.refined("doo_sabin")
 
 

@@ -13,9 +13,10 @@ from ..cage import ControlCage
 from ..cage.contents import Attribute
 from ..evaluation.located_samples import limit_stencils
 from ..mesh.connectivity import IntArray, Topology, VertexRule
-from ..mesh.cuts import seams, value_mesh
+from ..mesh.cuts import seams
 from ..mesh.shared import Content, Shared
-from ..schemes import Scheme, SchemeError
+from ..refinement.adapted_scheme import subdivided_values
+from ..schemes import Scheme
 from ..schemes.domain import FloatArray
 from .patch_samples import PatchSampler, stencil_matrices
 from .patch_table import PatchTable
@@ -184,28 +185,15 @@ def _layout_of(
     lies_on_seam = seams(cage.topology, indices)
     seam = lies_on_seam if lies_on_seam.any() else None
     is_linear = attribute.interpolation == "varying" or cage.face_varying == "all"
-    if scheme.element == "vertex":
-        if is_linear or seam is not None:
-            need = "seams" if seam is not None else "linear interpolation"
-            raise SchemeError(
-                f'{cage.source.name}: the scheme {scheme.name} has no rules for {need}, as of the attribute "{name}"; '
-                "expected one that is subdivided as points are, without seams"
-            )
-        value_index: IntArray = np.zeros(patches.topology.vertex_count, dtype=np.int64)
-        value_index[patches.topology.face_vertices] = indices
-        return ChannelLayout(patches, value_index)
-    if is_linear or (
-        scheme.has_phantom_points and _is_cut_into_faces(cage, scheme, lies_on_seam) and _is_linear_alone(scheme)
+    if scheme.element == "face" and (
+        is_linear
+        or (scheme.has_phantom_points and _is_cut_into_faces(cage, scheme, lies_on_seam) and _is_linear_alone(scheme))
     ):
         return ChannelLayout(patches, indices, seam, is_linear=True)
-    topology, value_index = value_mesh(cage.structure, cage.face_varying, indices)
-    if not scheme.has_phantom_points and ((topology.twin < 0).any() or topology.vertex_rules.any()):
-        raise SchemeError(
-            f'{cage.source.name}: the scheme {scheme.name} has no rules for seams, as of the attribute "{name}", as it '
-            'states no phantom_points; expected an attribute without seams, or face_varying "all"'
-        )
-    value_patches = patches if topology is patches.topology else PatchTable(topology, scheme, patches.is_hole)
-    return ChannelLayout(value_patches, value_index, seam)
+    topology, value_index = subdivided_values(cage, scheme, name, attribute)
+    if scheme.element == "vertex" or topology is patches.topology:
+        return ChannelLayout(patches, value_index, seam)
+    return ChannelLayout(PatchTable(topology, scheme, patches.is_hole), value_index, seam)
 
 
 def _is_cut_into_faces(cage: ControlCage, scheme: Scheme, lies_on_seam: NDArray[np.bool_]) -> bool:

@@ -1,9 +1,14 @@
-"""Scheme of a cage with the rules of the cage."""
+"""Scheme of a cage with the rules of the cage, for its points and for its attributes."""
 
 from __future__ import annotations
 
+import numpy as np
+
+from ..cage.contents import Attribute
 from ..cage.control_cage import ControlCage
-from ..cage.errors import warn
+from ..cage.errors import shortened, warn
+from ..mesh.connectivity import IntArray, Topology
+from ..mesh.cuts import seams, value_mesh
 from ..schemes import Scheme, SchemeError, scheme_named, with_rules
 from ..schemes.scheme import require_scheme
 
@@ -66,3 +71,32 @@ def _with_rules_of(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
         )
     except SchemeError as error:
         raise SchemeError(f"{cage.source.name}: {error}") from None
+
+
+def subdivided_values(cage: ControlCage, scheme: Scheme, name: str, attribute: Attribute) -> tuple[Topology, IntArray]:
+    """Return the mesh on which an attribute's values at corners are subdivided, and the row of each vertex's value.
+
+    Raises SchemeError if the scheme has no rules for the attribute.
+    """
+    # Varying attributes have one value per vertex instead of indices.
+    indices = cage.topology.face_vertices if attribute.indices is None else attribute.indices
+    label = f"{cage.source.name}: the scheme {scheme.name} has no rules for"
+    of_attribute = f'as of the attribute "{shortened(name)}"'
+    if scheme.element == "face":
+        topology, value_index = value_mesh(cage.structure, cage.face_varying, indices)
+        if not scheme.has_phantom_points and ((topology.twin < 0).any() or topology.vertex_rules.any()):
+            raise SchemeError(
+                f"{label} seams, {of_attribute}, as it states no phantom_points; expected an attribute without seams, "
+                'or face_varying "all"'
+            )
+        return topology, value_index
+    has_seams = seams(cage.topology, indices).any()
+    if has_seams or attribute.interpolation == "varying" or cage.face_varying == "all":
+        raise SchemeError(
+            f"{label} {'seams' if has_seams else 'linear interpolation'}, {of_attribute}; expected one that is "
+            "subdivided as points are, without seams"
+        )
+    topology = cage.cut_mesh.topology
+    value_index = np.zeros(topology.vertex_count, dtype=np.int64)
+    value_index[topology.face_vertices] = indices
+    return topology, value_index

@@ -23,7 +23,7 @@ from ..mesh.sharpness import INFINITE
 from ..schemes import Scheme, SchemeError
 from ..schemes.scheme import Refinement
 from .adapted_scheme import adapted_scheme
-from .refined_corners import RefinedCorners, differences, dual_attributes, refined_attributes
+from .refined_corners import RefinedCorners, common_mode, differences, refined_attributes
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -103,9 +103,9 @@ def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRe
             "an edge twice; expected none that does"
         )
     if cage.texcoords is not None or cage.attributes:
-        mode, texcoords, attributes = refined_attributes(cage, refined, scheme, refinement, matrix, corners)
-        rules = {**contents.rules, "face_varying": mode}
-        refined = built(replace(contents, rules=rules, texcoords=texcoords, attributes=attributes))
+        attributes, value_meshes = refined_attributes(cage, scheme, refinement, matrix, corners)
+        rules = {**contents.rules, "face_varying": common_mode(cage, refined, value_meshes, corners)}
+        refined = built(replace(contents, rules=rules, **attributes))
     return CageRefinement(refined, matrix, element, corner)
 
 
@@ -181,15 +181,14 @@ def _dual(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefi
             "for each face corner, as Doo-Sabin has"
         )
     matrix = _over_control_points(cage, refinement, np.arange(t.vertex_count))
-    texcoords, attributes = dual_attributes(cage, scheme, refinement, matrix)
+    attributes, _ = refined_attributes(cage, scheme, refinement, matrix, None)
     refined = built(
         replace(
             contents,
             positions=matrix @ cage.positions,
             face_sizes=t.face_sizes,
             face_vertices=t.face_vertices,
-            texcoords=texcoords,
-            attributes=attributes,
+            **attributes,
         )
     )
     element, corner = np.full((2, t.vertex_count), -1, dtype=np.int64)

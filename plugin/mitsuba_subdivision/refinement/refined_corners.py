@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,15 +13,15 @@ from ..cage.contents import RULES, Attribute
 from ..cage.control_cage import ControlCage
 from ..cage.errors import CageError, shortened
 from ..mesh.connectivity import IntArray, Topology, VertexRule
-from ..mesh.cuts import seams, value_mesh
+from ..mesh.cuts import value_mesh
 from ..schemes import Scheme, SchemeError
 from ..schemes.scheme import Refinement
+from .adapted_scheme import subdivided_values
 
 if TYPE_CHECKING:
     from scipy import sparse
 
 TEXCOORDS = "texcoords"
-RefinedAttributes = tuple[Attribute | None, dict[str, Attribute]]
 
 # Tolerance when comparing sharpness. Chaikin's method averages a few numbers below ten, whose order may differ.
 MEAN_TOLERANCE = 1e-13
@@ -180,31 +180,31 @@ def _are_one_to_one(one: IntArray, other: IntArray) -> bool:
 
 def refined_attributes(
     cage: ControlCage,
-    refined: ControlCage,  # The refined cage with all tags, without attributes
     scheme: Scheme,
     refinement: Refinement,  # Refinement of the cut mesh
     matrix: sparse.csr_array,  # (n, n_v) weights of the refined cage's vertices over the cage's
-    corners: RefinedCorners,
-) -> tuple[str, Attribute | None, dict[str, Attribute]]:
-    """Refine texture coordinates and attributes with a scheme whose elements are faces.
+    corners: RefinedCorners | None,  # None under Doo-Sabin, which subdivides all values like points
+) -> tuple[dict[str, Any], dict[str, ValueMesh]]:
+    """Refine texture coordinates and attributes.
 
-    Whether face-varying values are corners depends on the seams at a vertex, and may differ in the refined cage. Then
-    the refined cage gets another face-varying rule that has the same corners.
+    Raises SchemeError if the scheme does not support the interpolation of an attribute, or its seams.
 
-    Raises CageError if no rule has the same corners. Raises SchemeError if an attribute has seams and the scheme does
-    not support them.
-
-    Returns the face-varying rule for the refined cage, its texture coordinates and its attributes.
+    Returns ``texcoords`` and ``attributes`` of the refined cage, and the value meshes of attributes with seams.
     """
     attributes: dict[str, Attribute] = {}
     value_meshes: dict[str, ValueMesh] = {}
-    for name, attribute in _named(cage).items():
+    given = cage.attributes if cage.texcoords is None else {TEXCOORDS: cage.texcoords, **cage.attributes}
+    for name, attribute in given.items():
         values, indices = attribute.values, attribute.indices
         if attribute.interpolation == "vertex":
             attributes[name] = Attribute(matrix @ values)
+        elif corners is None:
+            t, value_index = subdivided_values(cage, scheme, name, attribute)
+            new_values = refinement.apply(values[value_index])
+            attributes[name] = Attribute(new_values, "face_varying", refinement.topology.face_vertices)
         elif indices is None:
             # Unused vertices keep their values.
-            varying = np.zeros((refined.vertex_count, values.shape[1]))
+            varying = np.zeros((len(corners.copies), values.shape[1]))
             varying[: len(values)] = values
             varying[corners.vertex] = corners.linear(values[cage.face_vertices])
             attributes[name] = Attribute(varying, "varying")
@@ -213,75 +213,43 @@ def refined_attributes(
             if cage.face_varying == "all":
                 corner_values: NDArray[np.floating] = corners.linear(values[indices])
             else:
-                t, value_index = value_mesh(cage.structure, cage.face_varying, indices)
-                if not scheme.has_phantom_points and ((t.twin < 0).any() or t.vertex_rules.any()):
-                    raise SchemeError(
-                        f"{cage.source.name}: the scheme {scheme.name} has no rules for seams, as of the attribute "
-                        f'"{shortened(name)}"; expected an attribute without seams, or face_varying "all"'
-                    )
+                t, value_index = subdivided_values(cage, scheme, name, attribute)
                 of_values = refinement if t is cage.cut_mesh.topology else scheme.refine(t)
                 corner_values = of_values.apply(values[value_index])[of_values.topology.face_vertices]
                 stays = corners.at_ends(t.vertex_rules == VertexRule.CORNER, t)
                 value_meshes[name] = of_values.topology, stays, new_indices
             attributes[name] = Attribute(corner_values[first], "face_varying", new_indices)
-    mode = _common_mode(cage, refined, value_meshes, corners)
-    return mode, attributes.pop(TEXCOORDS, None), attributes
+    return {"texcoords": attributes.pop(TEXCOORDS, None), "attributes": attributes}, value_meshes
 
 
-def dual_attributes(
-    cage: ControlCage, scheme: Scheme, refinement: Refinement, matrix: sparse.csr_array
-) -> RefinedAttributes:
-    """Refine texture coordinates and attributes with Doo-Sabin, which subdivides them like points.
-
-    Raises SchemeError if one is interpolated linearly, or has seams.
-    """
-    attributes: dict[str, Attribute] = {}
-    for name, attribute in _named(cage).items():
-        values, indices = attribute.values, attribute.indices
-        if attribute.interpolation == "vertex":
-            attributes[name] = Attribute(matrix @ values)
-            continue
-        if indices is None or cage.face_varying == "all" or seams(cage.topology, indices).any():
-            raise SchemeError(
-                f'{cage.source.name}: the scheme {scheme.name} has no rules for the attribute "{shortened(name)}"; '
-                "expected one that is subdivided as points are, without seams"
-            )
-        row = np.zeros(cage.cut_mesh.topology.vertex_count, dtype=np.int64)
-        row[cage.cut_mesh.topology.face_vertices] = indices
-        attributes[name] = Attribute(refinement.apply(values[row]), "face_varying", refinement.topology.face_vertices)
-    return attributes.pop(TEXCOORDS, None), attributes
-
-
-def _named(cage: ControlCage) -> dict[str, Attribute]:
-    return {**({} if cage.texcoords is None else {TEXCOORDS: cage.texcoords}), **cage.attributes}
-
-
-def _common_mode(
-    cage: ControlCage, refined: ControlCage, value_meshes: dict[str, ValueMesh], corners: RefinedCorners
+def common_mode(
+    cage: ControlCage,
+    refined: ControlCage,  # The refined cage with all tags, without attributes
+    value_meshes: dict[str, ValueMesh],
+    corners: RefinedCorners,
 ) -> str:
-    """Return the face-varying rule for which the refined cage has the refined value meshes, if possible the cage's."""
+    """Return the face-varying rule for which the refined cage has the refined value meshes, if possible the cage's.
 
-    def first_wrong(mode: str) -> tuple[str, int] | None:
-        """Return the first attribute and refined corner at which the value mesh differs; None if all are equal."""
+    Whether face-varying values are corners depends on the seams at a vertex, and may differ in the refined cage. Then
+    it gets another rule that has the same corners. Raises CageError if there is none.
+    """
+    problems: list[tuple[str, int]] = []
+    others = [mode for mode in RULES["face_varying"] if mode not in ("all", cage.face_varying)]
+    for mode in (cage.face_varying, *others):
+        # The first attribute and refined corner at which the value mesh differs.
         for name, (expected, stays, indices) in value_meshes.items():
             *_, is_wrong = differences(expected, value_mesh(refined.structure, mode, indices)[0], stays)
             if is_wrong.any():
-                return name, int(np.argmax(is_wrong))
-        return None
-
-    cage_mode = cage.face_varying
-    wrong = first_wrong(cage_mode)
-    if wrong is None:
-        return cage_mode
-    for mode in RULES["face_varying"]:
-        if mode not in (cage_mode, "all") and first_wrong(mode) is None:
+                problems.append((name, int(np.argmax(is_wrong))))
+                break
+        else:
             return mode
-    name, corner = wrong
+    name, corner = problems[0]
     where = cage.source.at_face(int(cage.topology.face[corners.half_edge[corner]]))
     raise CageError(
         f'{where}: the attribute "{shortened(name)}" has corners and borders along seams that no face_varying rule '
         "gives the refined cage, as they come from semi-sharp features of unequal sharpness on both sides of a seam; "
-        f'expected face_varying "all", or an attribute without such seams (now "{cage_mode}")'
+        f'expected face_varying "all", or an attribute without such seams (now "{cage.face_varying}")'
     )
 
 
