@@ -26,7 +26,7 @@ if not BLENDER:
     pytest.skip("there is neither the program blender nor the package bpy", allow_module_level=True)
 
 SCRIPT = Path(__file__).parents[2] / "scenes" / "export_cage.py"
-MODEL, LOOK = (Path(__file__).with_name(name) for name in ("model.py", "look.py"))
+SCENES = Path(__file__).with_name("scenes.py")
 SEGMENTS = 8  # 2 ** LEVEL of the model.
 # Blender computes in single precision, with coordinates up to 3, and its patches at vertices with creases are
 # approximations, of which the model asks the best.
@@ -45,10 +45,10 @@ def blender(script, *arguments, scene=None):
     return subprocess.run(command, capture_output=True, text=True, encoding="utf-8", timeout=100, check=False)
 
 
-def exported(model, usda, script, *files):
-    """What an export of a scene tells, which a script for Blender makes with other files."""
-    made = blender(script, model, *files)
-    assert all(path.exists() for path in files), made.stdout + made.stderr
+def exported(kind, model, usda, other):
+    """What an export of a scene tells, which Blender makes with another file."""
+    made = blender(SCENES, kind, model, other)
+    assert other.exists(), made.stdout + made.stderr
     done = blender(SCRIPT, usda, scene=model)
     assert done.returncode == 0, done.stderr
     return done.stderr
@@ -59,7 +59,7 @@ def scene(tmp_path_factory):
     """A scene, its export as USD, what Blender makes of each object, and what the export tells."""
     folder = tmp_path_factory.mktemp("blender")
     model, usda, answers = (folder / name for name in ("model.blend", "model.usda", "answers.json"))
-    told = exported(model, usda, MODEL, answers)
+    told = exported("model", model, usda, answers)
     return model, usda, {name: np.array(rows) for name, rows in json.loads(answers.read_text()).items()}, told
 
 
@@ -68,7 +68,7 @@ def look(tmp_path_factory):
     """The picture of a scene of materials by Cycles, its export, and what that tells."""
     folder = tmp_path_factory.mktemp("look")
     model, usda, picture = (folder / name for name in ("look.blend", "look.usda", "look.exr"))
-    return picture, usda, exported(model, usda, LOOK, picture)
+    return picture, usda, exported("look", model, usda, picture)
 
 
 def cage_of(usda, name):

@@ -1,7 +1,6 @@
 """MaterialX documents and networks of stages: composed by USD, read as expressions, and seen."""
 
 import warnings
-import zipfile
 
 import mitsuba as mi
 import mitsuba_subdivision as msub
@@ -287,18 +286,12 @@ def test_colours_are_linear_unless_their_space_is_that_of_srgb(stage, space, is_
 def test_packages_hold_documents_and_their_pictures(tmp_path):
     picture(tmp_path / "color.png", 255)
     image = element("image", "i", "color3", given("file", "filename", value="../tex/color.png"))
-    red = document(given("base_color", "color3", nodename="i"), graph=image)
-    root = write(tmp_path, looks("looks/red.mtlx") + SMOOTH_SQUARE)
+    (tmp_path / "red.mtlx").write_text(document(given("base_color", "color3", nodename="i"), graph=image))
+    write(tmp_path, looks("looks/red.mtlx") + SMOOTH_SQUARE)
     package = tmp_path / "all.usdz"
-    # Files of a package are not compressed, and begin at multiples of 64 bytes.
-    contents = {"stage.usda": root.read_bytes(), "looks/red.mtlx": red.encode()}
-    contents["tex/color.png"] = (tmp_path / "color.png").read_bytes()
-    with zipfile.ZipFile(package, "w") as archive:
-        for name, content in contents.items():
-            info = zipfile.ZipInfo(name)
-            place = archive.fp.tell() + 30 + len(name)
-            info.extra = b"\x86\x19" + ((-place - 4) % 64).to_bytes(2, "little") + bytes((-place - 4) % 64)
-            archive.writestr(info, content)
+    with Sdf.ZipFileWriter.CreateNew(str(package)) as archive:
+        for name in ("stage.usda", "looks/red.mtlx", "tex/color.png"):
+            archive.AddFile(str(tmp_path / name.rpartition("/")[2]), name)
     assert material(package).inputs["base_color"].file == f"{package}[tex/color.png]"
     pixels = np.array(msub.usd_scene(package, mi)["Looks_Red"]["bsdf"]["base_color"]["bitmap"])
     assert (pixels == 255).all()
