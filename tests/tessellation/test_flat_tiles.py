@@ -94,8 +94,7 @@ def test_surfaces_are_hardly_smaller_than_their_extents(name, axis_count, is_con
 def test_the_unit_and_the_origin_do_not_matter(unit, np_rng):
     surface, axes = surface_named("cube"), np_rng.normal(size=(1, 3))
     ((tile, values, samples),) = tiles_of(surface, surface.scheme)
-    # Of eigen-coordinates, the first one is a point.
-    values[: 1 if tile.is_self_similar else None] += FAR
+    values += FAR
     assert_tight([extents(tile, unit * values, axes) / unit], axes, [samples])
 
 

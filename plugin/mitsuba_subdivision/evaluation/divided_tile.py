@@ -4,9 +4,10 @@ A *tile* is the domain of a patch, or one of the four children of a tile. Tiles 
 in the directions of the patch's, except in the middle children of triangles, where they run backwards.
 
 The control points of a tile inside one polynomial piece are Bernstein coefficients, and so are those of its children. A
-tile with several pieces is divided into its four children. Around an extraordinary point three children are the regular
-pieces of a level, and the fourth, which contains the point, is divided in the same way. Tiles of different patches that
-are divided in the same way share one `DividedTile` and its bounds; only their control points differ.
+tile with several pieces is divided into its four children, and its control points are those of its one-ring. Around an
+extraordinary point three children are pieces, and the fourth, which contains the point, is a tile of the same kind.
+Tiles of different patches that are divided in the same way share one `DividedTile` and its bounds; only their control
+points differ.
 """
 
 from __future__ import annotations
@@ -17,11 +18,12 @@ import numpy as np
 
 from ..mesh.connectivity import IntArray
 from ..mesh.one_ring import one_ring
-from ..schemes.domain import FloatArray, ParameterDomain
+from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-from .irregular_patch import IrregularPatch, level_rows, rest_rows
-from .patch_tree import PartKind, PatchTree
-from .polynomials import polynomial_basis, times
+from .irregular_patch import rest_rows
+from .patch_tree import PartKind, PatchTree, patch_tree
+from .polynomials import polynomial_basis
+from .refined_rings import refined_children
 
 # Number of divisions before a tile is bounded by its pieces and the parts that are still undivided. For surfaces it
 # depends on `Scheme.has_convex_rules`: without convex rules the bound of undivided parts is some ten times looser.
@@ -37,70 +39,49 @@ class DividedTile:
     def __init__(
         self,
         scheme: Scheme,
-        # The element that the tile covers; or the patch around an extraordinary point, at any level, with
-        # eigen-coordinates as control points; or None for a polynomial piece
-        source: PatchTree | IrregularPatch | None,
-        # Argument of `ParameterDomain.rotation` that maps the tile's parameters to those of the patch around an
-        # extraordinary point. 0 for elements.
-        turn: int,
+        element: PatchTree | None,  # That the tile covers; None for a polynomial piece
     ) -> None:
-        self._scheme, self._source, self._turn = scheme, source, turn
+        self._scheme, self._element = scheme, element
         self._bernstein = polynomial_basis(scheme).bernstein
-        self.is_piece = source is None
+        self.is_piece = element is None
         # Whether the tile has an extraordinary point at a corner, so that one child equals the tile.
-        self.is_self_similar = isinstance(source, IrregularPatch)
-        # (n, K) stencils of the control points of the one-ring, or of a piece, over the tile's control points.
-        if isinstance(source, IrregularPatch):
-            self.control_points: FloatArray = source.basis.vectors
-        else:
-            self.control_points = np.eye(len(self._bernstein.indices) if source is None else source.control_count)
+        self.is_self_similar = element is not None and element.kind == PartKind.TIP
+        control_count = len(self._bernstein.indices) if element is None else element.control_count
+        self._control_points = np.eye(control_count)
 
     @cached_property
     def children(self) -> tuple[tuple[DividedTile, FloatArray], ...]:
         """The children, in the order of `ParameterDomain.children`, as returned by `part_of_tile`."""
-        scheme, source, turn = self._scheme, self._source, self._turn
-        if source is None:
+        if self._element is None:
             return tuple((self, rows) for rows in self._bernstein.halves)
-        if isinstance(source, PatchTree):
-            return tuple(part_of_tile(child, stencils) for child, stencils in source.children)
-        # The same tile at the next level, and three pieces.
-        parts = [(self, source.basis.block_matrix())]
-        parts += [(_tile(scheme, None, 0), _turned(scheme, turn) @ rows) for rows in level_rows(source, 0)]
-        return tuple(parts[number] for number in _children_before_turn(scheme.domain, turn))
+        children = self._element.children
+        if self.is_self_similar:
+            (refined,) = refined_children(self._scheme, [self._element.signature])
+            children = [(patch_tree(self._scheme, child.signature), child.stencils) for child in refined]
+        return tuple(part_of_tile(child, stencils) for child, stencils in children)
 
     @cached_property
     def corners(self) -> FloatArray:
         """``(m, K)`` stencils of the surface points at the tile's corners."""
-        identity = np.eye(self.control_points.shape[1])
-        if self.is_piece:
-            return identity[self._bernstein.corners]
-        corners = []
+        if self._element is None:
+            return self._control_points[self._bernstein.corners]
+        corners, tip = [], self._element.piece
         for number, (tile, rows) in enumerate(self.children[: self._scheme.domain.corner_count]):
             # The first eigen-coordinate is the extraordinary point.
-            corners.append(identity[0] if tile is self else (tile.corners @ rows)[number])
+            corners.append((tile.corners @ rows)[number] if tip is None or tile is not self else tip.coordinates[0])
         return np.array(corners)
 
     @cached_property
     def control_faces(self) -> IntArray:
-        """``(4, f)`` rows of `control_points`: ends of one diagonal, then of the other, of the one-ring's faces.
+        """``(4, f)`` control points: ends of one diagonal, then of the other, of the one-ring's faces.
 
-        For triangles, two sides in place of diagonals. At a dart one of two equal vertices of the ring is left out, and
-        so are its faces. A piece has no faces.
+        For triangles, two sides in place of diagonals. A piece has no faces.
         """
-        if self._source is None:
+        if self._element is None:
             return np.empty((4, 0), dtype=np.int64)
-        t = one_ring(self._source.signature).topology
+        t = one_ring(self._element.signature.smoothed).topology
         a, b, c, d = t.face_vertices[t.face_offsets[:-1] + np.arange(4)[:, None] * t.face_sizes // 4]
-        vertices = np.stack([a, c, b, d])
-        if isinstance(self._source, IrregularPatch):
-            number = np.full(t.vertex_count, -1)
-            number[self._source.slots] = np.arange(len(self._source.slots))
-            vertices = number[vertices]
-        return vertices[:, (vertices >= 0).all(axis=0)]
-
-    def one_ring_points(self, points: FloatArray) -> FloatArray:
-        """Return control points ``(n, d, t)`` of one-rings, from those of t tiles ``(K, d, t)``."""
-        return times(self.control_points, points) if self.is_self_similar else points
+        return np.stack([a, c, b, d])
 
     @cached_property
     def tangents(self) -> FloatArray | None:
@@ -143,12 +124,13 @@ class DividedTile:
     @cached_property
     def _reach(self) -> FloatArray:
         """``(n, K)`` stencils of points around an undivided tile: its one-ring, or a bound of `rest_rows`."""
-        if self._scheme.has_convex_rules or not isinstance(self._source, IrregularPatch):
-            return self.control_points
+        tip = None if self._element is None else self._element.piece
+        if self._scheme.has_convex_rules or tip is None:
+            return self._control_points
         # The sum of n vectors is the mean of n times each of them.
-        bound = rest_rows(self._source).max(axis=0)
+        bound = rest_rows(tip.irregular_patch).max(axis=0)
         away = np.diag((len(bound) - 1) * bound)[1:]
-        return np.eye(1, len(bound)) + np.concatenate([away, -away])
+        return (np.eye(1, len(bound)) + np.concatenate([away, -away])) @ tip.coordinates
 
     def _divided(
         self, divisions: int, side: int | None = None
@@ -158,7 +140,7 @@ class DividedTile:
         Returns the Bernstein coefficients ``(b, K)`` of pieces, or of their sides, and the undivided tiles with the
         stencils of their control points.
         """
-        identity, m = np.eye(self.control_points.shape[1]), self._scheme.domain.corner_count
+        identity, m = self._control_points, self._scheme.domain.corner_count
         if self.is_piece:
             return [identity if side is None else identity[self._bernstein.sides[side]]], []
         if not divisions:
@@ -184,33 +166,14 @@ def part_of_tile(
 
     Also returns the tile's control points over those of the parent tile, (n, K) float64.
     """
-    scheme, piece = element.scheme, element.piece
-    if piece is None:
-        if element.kind == PartKind.ONLY_CHILD:
-            ((child, child_stencils),) = element.children
-            return part_of_tile(child, child_stencils @ stencils)
-        return _tile(scheme, element, 0), stencils
-    if piece.patch is None:
-        return _tile(scheme, None, 0), polynomial_basis(scheme).of_controls @ piece.stencils @ stencils
-    return _tile(scheme, piece.patch, element.turn), piece.coordinates @ stencils
+    if element.kind == PartKind.ONLY_CHILD:
+        ((child, child_stencils),) = element.children
+        return part_of_tile(child, child_stencils @ stencils)
+    if element.kind == PartKind.REGULAR and element.piece is not None:
+        of_controls = polynomial_basis(element.scheme).of_controls
+        return _tile(element.scheme, None), of_controls @ element.piece.stencils @ stencils
+    return _tile(element.scheme, element), stencils
 
 
 # A tile takes some 20 kB.
 _tile = lru_cache(maxsize=4096)(DividedTile)
-
-
-@lru_cache(maxsize=64)
-def _turned(scheme: Scheme, turn: int) -> FloatArray:
-    """Return the ``(b, b)`` map from Bernstein coefficients to those of the polynomial in turned parameters."""
-    basis, domain = polynomial_basis(scheme).bernstein, scheme.domain
-    return basis.coefficients(basis.values(domain.rotation(turn)(basis.indices / basis.degree)))
-
-
-@lru_cache(maxsize=64)
-def _children_before_turn(domain: ParameterDomain, turn: int) -> tuple[int, ...]:
-    """Return, for each child of a domain, its number among the children of the turned domain."""
-    rotation, children = domain.rotation(turn), domain.children
-    return tuple(
-        next(i for i, turned in enumerate(children) if (turned @ rotation).is_same(rotation @ child))
-        for child in children
-    )

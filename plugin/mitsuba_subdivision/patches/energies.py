@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..evaluation.eigenbasis import CLUSTER_WIDTH
 from ..evaluation.irregular_patch import IrregularPatch, level_rows
 from ..evaluation.patch_tree import patch_trees
 from ..evaluation.polynomials import polynomial_basis
@@ -119,7 +120,8 @@ def _level_count(patch: IrregularPatch, derivative: int) -> int:
     """
     _, second, third, fourth, *_ = patch.basis.moduli
     ratio = second * third if derivative == FIRST else (fourth / third**2) ** 2 * second * third
-    return min(int(np.ceil(np.log(TAIL) / np.log(ratio))), MOST_LEVELS) if ratio < 1 else 1
+    # Up to rounding: at one, every level has the same energy.
+    return min(int(np.ceil(np.log(TAIL) / np.log(ratio))), MOST_LEVELS) if ratio < 1 - CLUSTER_WIDTH else 1
 
 
 def gradients(basis: FloatArray, points: FloatArray) -> FloatArray:

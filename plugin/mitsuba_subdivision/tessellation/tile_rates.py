@@ -123,8 +123,7 @@ class TileRates:
         self, kind: DividedTile, tiles: Tiles, values: FloatArray, heights: FloatArray | None = None
     ) -> NDArray[np.bool_]:
         """``(t,)`` whether two triangles (or one) approximate each tile within the limit, also along feature edges."""
-        corners, ring = times(kind.corners, values), kind.one_ring_points(values)
-        lower, upper = ring.min(axis=0), ring.max(axis=0)
+        corners, lower, upper = times(kind.corners, values), values.min(axis=0), values.max(axis=0)
         limit = self.criterion.limit(lower, upper)
         height_range = np.zeros(len(tiles))
         if heights is not None:
@@ -145,7 +144,7 @@ class TileRates:
             is_flat[tested] = extent[tested] <= limit[tested]
         # Tiles whose control faces are folded along the axis need a bound of their normals.
         folded = np.flatnonzero(is_flat & ~fits)
-        folded = folded[_are_folded(kind, ring.take(folded, axis=2), axis.take(folded, axis=1))]
+        folded = folded[_are_folded(kind, values.take(folded, axis=2), axis.take(folded, axis=1))]
         is_flat[folded] = _normals(kind, values.take(folded, axis=2), axis.take(folded, axis=1)).sine < 1
         if self.criterion.outline is not None:
             # Tiles on a border are left out, as it may be a silhouette for any normals.
