@@ -365,11 +365,6 @@ class ControlCage:
         return self.structure.is_boundary_vertex
 
     @property
-    def sharp_mesh(self) -> SharpMesh:
-        """The cage's mesh with its sharp edges and vertices: `structure`."""
-        return self.structure
-
-    @property
     def cut_mesh(self) -> CutMesh:
         """The cage cut along its infinitely sharp edges, with the rules of its vertices."""
         return self.structure.cut

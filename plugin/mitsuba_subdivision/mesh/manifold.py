@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 
 from .connectivity import IntArray, Topology
 
-# Maximum number of corners of faces that are checked without sorting, and of faces of vertices that are checked without
-# pointer doubling.
+# Maximum number of corners of faces that are checked without sorting.
 FEW_CORNERS = 8
-FEW_FACES = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +93,6 @@ def _has_single_fans(topology: Topology) -> bool:
     Walks around all vertices simultaneously. A fan must end after as many faces as its vertex has, and not before.
     """
     t = topology
-    if t.vertex_face_count.max() > FEW_FACES:
-        return not (fan_counts(t, fan_labels(t)[1]) > 1).any()
     count = t.vertex_face_count
     start = np.where(t.open_fan_start < 0, t.vertex_half_edge, t.open_fan_start)[count > 0]
     current, count = start, count[count > 0]
