@@ -57,12 +57,12 @@ CRASHES = pytest.mark.skipif(not hasattr(os, "kill"), reason="processes have no 
         pytest.param("import os; os.abort()", "the process crashed (SIGABRT)", marks=CRASHES),
         ("raise SystemExit('no such library')", "the process ended with 1: no such library"),
         ("pass", "the process ended with 0: no output"),
-        ("import time; time.sleep(60)", "did not end within 0.5 s"),
+        ("import time; time.sleep(60)", "did not end within 0.2 s"),
     ],
 )
 def test_how_a_process_ends_is_told(monkeypatch, child, problem):
     monkeypatch.setattr(doctor, "_CHILD", child)
-    report = try_variant("scalar_rgb", seconds=0.5 if "sleep" in child else 60)
+    report = try_variant("scalar_rgb", seconds=0.2 if "sleep" in child else 60)
     assert (report["works"], report["problem"]) == (False, problem)
 
 

@@ -85,15 +85,6 @@ def test_version_by_the_name_behind_links(tmp_path):
     assert llvm.library_version(tmp_path / "libLLVM.so") == 19
 
 
-def test_environment_of_python_comes_before_a_newer_system(fresh):
-    python, system = fresh
-    (python / "libLLVM.so.19.1").touch()
-    (system / "libLLVM.so.22.1").touch()
-    choice = llvm.select_llvm()
-    assert (choice.path, choice.version) == (str(python / "libLLVM.so.19.1"), 19)
-    assert os.environ[llvm.ENVIRONMENT_VARIABLE] == choice.path
-
-
 def test_libraries_of_the_wheel_are_found_wherever_they_lie(monkeypatch, tmp_path):
     record = tmp_path / "site/karellen_llvm_core-19.1.0.dist-info"
     record.mkdir(parents=True)
@@ -122,49 +113,36 @@ def test_a_folder_with_a_star_stands_for_all_whose_names_begin_so(tmp_path):
     assert sorted(libraries) == [str(tmp_path / f"llvm-{version}/lib/libLLVM-{version}.so") for version in (18, 19)]
 
 
-def test_the_newest_of_the_system_is_chosen_and_no_file_that_is_no_library(fresh):
-    (fresh[1] / "libLLVM.so").touch()
-    assert llvm.select_llvm().path is None
-    for name in ("libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM-17.so.1"):
-        (fresh[1] / name).touch()
-    llvm.select_llvm.cache_clear()
-    assert llvm.select_llvm().version == 19
-
-
-def test_old_ones_alone_are_never_used(fresh):
-    python, system = fresh
-    (python / "libLLVM-16.so").touch()
-    (system / "libLLVM-14.so.1").touch()
+@pytest.mark.parametrize(
+    ("python", "system", "machine", "setting", "version"),
+    [
+        (["libLLVM.so.19.1"], ["libLLVM.so.22.1"], "x86_64", None, 19),
+        ([], ["libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM.so.19.1", "libLLVM-17.so.1"], "x86_64", None, 19),
+        # Nothing leaves the search to Dr.Jit; old ones alone are never used, unless the processor lacks instructions.
+        ([], ["libLLVM.so"], "x86_64", None, None),
+        (["libLLVM-16.so"], ["libLLVM-14.so.1"], "x86_64", None, llvm.NO_USABLE_LLVM),
+        ([], ["libLLVM-15.so.1"], "aarch64", None, 15),
+        # The user's own setting stands; what a parent process did not find is looked for again.
+        (["libLLVM.so.19.1"], [], "x86_64", "/opt/libLLVM-15.so", 15),
+        (["libLLVM.so.19.1"], [], "x86_64", llvm.NO_USABLE_LLVM, 19),
+    ],
+)
+def test_a_usable_library_of_python_comes_before_the_newest_of_the_system(
+    fresh, monkeypatch, python, system, machine, setting, version
+):
+    for folder, names in zip(fresh, (python, system), strict=True):
+        for name in names:
+            (folder / name).touch()
+    monkeypatch.setattr(llvm.platform, "machine", lambda: machine)
+    if setting:
+        monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, setting)
     choice = llvm.select_llvm()
-    assert choice.path is None
-    assert "17 or newer" in choice.reason
-    assert os.environ[llvm.ENVIRONMENT_VARIABLE] == llvm.NO_USABLE_LLVM
-
-
-def test_old_ones_are_good_enough_where_the_processor_has_the_instructions(fresh, monkeypatch):
-    monkeypatch.setattr(llvm.platform, "machine", lambda: "aarch64")
-    (fresh[1] / "libLLVM-15.so.1").touch()
-    assert llvm.select_llvm().version == 15
-
-
-@pytest.mark.usefixtures("fresh")
-def test_nothing_found_leaves_the_search_to_drjit():
-    assert llvm.select_llvm().path is None
-    assert llvm.ENVIRONMENT_VARIABLE not in os.environ
-
-
-def test_users_own_setting_stands(fresh, monkeypatch):
-    (fresh[0] / "libLLVM.so.19.1").touch()
-    monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, "/opt/libLLVM-15.so")
-    choice = llvm.select_llvm()
-    assert (choice.path, choice.version) == ("/opt/libLLVM-15.so", 15)
-    assert os.environ[llvm.ENVIRONMENT_VARIABLE] == "/opt/libLLVM-15.so"
-
-
-def test_what_a_parent_process_did_not_find_is_looked_for_again(fresh, monkeypatch):
-    monkeypatch.setenv(llvm.ENVIRONMENT_VARIABLE, llvm.NO_USABLE_LLVM)
-    (fresh[0] / "libLLVM.so.19.1").touch()
-    assert llvm.select_llvm().version == 19
+    if version == llvm.NO_USABLE_LLVM:
+        assert choice.path is None
+        assert "17 or newer" in choice.reason
+    else:
+        assert choice.version == version
+    assert os.environ.get(llvm.ENVIRONMENT_VARIABLE) == (choice.path or version)
 
 
 @NEEDS_LLVM

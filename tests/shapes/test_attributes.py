@@ -176,8 +176,7 @@ def test_frozen_functions_look_up_spectra(square):
 
 @exact
 @every_array_variant
-@pytest.mark.parametrize("displacement", [{}, {"displacement": "vertex_heat"}], ids=["flat", "displaced"])
-@pytest.mark.parametrize("kind", ["bitmap", "checkerboard"])
+@pytest.mark.parametrize(("kind", "displacement"), [("bitmap", {"displacement": "vertex_heat"}), ("checkerboard", {})])
 def test_textured_emitters_light_as_with_vertex_shading(kind, displacement):
     """Mitsuba draws points of them by the texture coordinates of the mesh, which had none."""
     cage = textured(attributes={"heat": np.linspace(0, 0.2, 8)[:, None]} if displacement else {})

@@ -233,7 +233,7 @@ scenes = {}
 for shading in ("vertex", "exact"):
     film = {"type": "hdrfilm", "width": 8, "height": 8}
     to_world = mi.ScalarTransform4f().look_at([1, 2, 3], [0, 0, 0], [0, 0, 1])
-    shapes = {f"shape{i}": shape(shading) for i in range(40)}
+    shapes = {f"shape{i}": shape(shading) for i in range(15)}
     scenes[shading] = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "sky": {"type": "constant"},
         "sensor": {"type": "perspective", "to_world": to_world, "film": film}, **shapes})
     mi.render(scenes[shading], spp=1)

@@ -99,18 +99,6 @@ def test_what_waits_within_constructors_loads():
 
 
 @llvm
-@pytest.mark.parametrize("parallel", [True, False], ids=["parallel", "one by one"])
-def test_many_shapes_load_from_xml(parallel, tmp_path):
-    cube().save(tmp_path / "cube.obj")
-    shape = """<shape type="subdivision"><string name="filename" value="cube.obj"/>
-        <integer name="tessellation_rate" value="2"/>
-        <transform name="to_world"><translate x="{}"/></transform></shape>"""
-    text = "".join(map(shape.format, range(SOME)))
-    (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0">{text}</scene>')
-    assert len(mi.load_file(str(tmp_path / "scene.xml"), parallel=parallel).shapes()) == SOME
-
-
-@llvm
 def test_an_error_in_one_of_many_shapes_is_that_of_the_load():
     with pytest.raises(RuntimeError, match='parameter "tessellation_rate" is 0; expected 1 to'):
         load([*[of(cube())] * SOME, {**of(cube()), "tessellation_rate": 0}])

@@ -256,7 +256,7 @@ def test_edges_between_copies_of_vertices_are_no_outlines(name):
 # Those of vertices along a crease are in tests/gradients/test_outlines.py.
 @pytest.mark.parametrize(("name", "shading"), [("seams", "vertex"), pytest.param("both", "exact", marks=exact)])
 def test_gradients_of_outlines_are_differences_where_vertices_have_copies(name, shading):
-    scene = views_of("direct_projective", SEAMED[name], resolution=24, shading=shading)
+    scene = views_of("direct_projective", SEAMED[name], shading=shading)
     parameters = mi.traverse(scene)
     start = mi.Float(parameters[KEY])
 
