@@ -188,11 +188,6 @@ def _fractal(n: SimpleNamespace) -> Values:
     return n.amplitude * noise.fractal(n.texcoord, octaves, n.lacunarity, n.diminish, n.width)
 
 
-def _truth(values: Values) -> Values:
-    """1 where a value is not zero, else 0."""
-    return (np.asarray(values) != 0).astype(np.float64)
-
-
 OPERATIONS: dict[str, Callable[[SimpleNamespace], Values]] = {
     "constant": lambda n: n.value,
     "dot": lambda n: n.in_,
@@ -221,9 +216,9 @@ OPERATIONS: dict[str, Callable[[SimpleNamespace], Values]] = {
     "clamp": lambda n: np.minimum(np.maximum(n.in_, n.low), n.high),
     "min": lambda n: np.minimum(n.in1, n.in2),
     "max": lambda n: np.maximum(n.in1, n.in2),
-    "and": lambda n: _truth(n.in1) * _truth(n.in2),
-    "or": lambda n: np.maximum(_truth(n.in1), _truth(n.in2)),
-    "not": lambda n: 1 - _truth(n.in_),
+    "and": lambda n: 1.0 * np.logical_and(n.in1, n.in2),
+    "or": lambda n: 1.0 * np.logical_or(n.in1, n.in2),
+    "not": lambda n: 1.0 * np.logical_not(n.in_),
     "normalize": lambda n: _unit(n.in_),
     "magnitude": lambda n: np.linalg.norm(n.in_, axis=-1, keepdims=True),
     "dotproduct": lambda n: np.sum(n.in1 * n.in2, axis=-1, keepdims=True),

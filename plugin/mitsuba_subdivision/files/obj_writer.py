@@ -27,6 +27,7 @@ def write_obj(contents: CageContents, path: str | Path) -> None:
     texcoords, owner = contents.texcoords, contents.material_of_face
     if texcoords is not None and texcoords.interpolation != "face_varying":
         texcoords = None
+    tagged = {rule: values.values() for rule, values in RULE_TAGS.values()}
     warn_of_losses(
         path,
         {
@@ -35,7 +36,10 @@ def write_obj(contents: CageContents, path: str | Path) -> None:
             "scheme": contents.scheme is not None,
             **{f'material "{name}"': not _is_possible(name) for name in contents.materials},
             "further materials of a face": sum(map(len, contents.materials.values())) > (owner >= 0).sum(),
-            **dict.fromkeys(_rules_without_tag(contents), True),
+            **{
+                f"{rule} {value}": value not in (RULES[rule][0], *tagged.get(rule, ()))
+                for rule, value in contents.rules.items()
+            },
         },
     )
     indices, corner = contents.face_vertices + 1, " %d"
@@ -107,9 +111,3 @@ def _tag_statements(contents: CageContents) -> str:
         if value != default and given is not None:
             lines.append(f"t {tag} {'0/0/1' if isinstance(given, str) else '1/0/0'} {given}\n")
     return "".join(lines)
-
-
-def _rules_without_tag(contents: CageContents) -> list[str]:
-    """Rules of a cage whose value no tag of OBJ stands for, as "rule value"."""
-    tagged = {rule: (RULES[rule][0], *values.values()) for rule, values in RULE_TAGS.values()}
-    return [f"{rule} {value}" for rule, value in contents.rules.items() if value not in tagged.get(rule, ())]

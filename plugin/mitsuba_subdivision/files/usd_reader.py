@@ -62,7 +62,7 @@ def read_usd(
     for mesh, location in zip(meshes, locations, strict=True):
         # Numbers that are not finite become errors that name their location.
         with usd_stage.usd_errors_at(location), np.errstate(over="ignore", invalid="ignore"):
-            contents.append(MeshReader(mesh, location, skinning, rules, is_cage=len(meshes) == 1).contents())
+            contents.append(MeshReader(mesh, location, skinning, rules).contents())
     return joined(contents, name)
 
 
@@ -78,9 +78,8 @@ class MeshReader:
         # Gets messages about attributes that do not fit the mesh, which are then left out, and their paths.
         # By default, these are errors.
         report: Callable[[str, object], None] | None = None,
-        is_cage: bool = False,  # Whether the mesh becomes a cage, which checks its values
     ) -> None:
-        self.mesh, self.location, self.skinning, self._is_cage = mesh, location, skinning, is_cage
+        self.mesh, self.location, self.skinning = mesh, location, skinning
         self._rules, self._report, self._source = rules or {}, report, CageSource(location)
 
     def contents(self, attributes: Collection[str] | None = None, texcoords: str | None = None) -> CageContents:
@@ -106,29 +105,33 @@ class MeshReader:
             vertices = vertices[order]
         if not np.array_equal(matrix, np.eye(4)):
             points = points @ matrix[:3, :3] + matrix[3, :3]
-        if not self._is_cage:
-            points = validated_positions(points, self._source)
-            require_vertices(len(points), sizes, vertices, self._source)
+        points = validated_positions(points, self._source)
+        require_vertices(len(points), sizes, vertices, self._source)
         topology = Topology(len(points), sizes, vertices)
 
         def tags(noun: str, read: Callable[[Topology], NDArray], otherwise: NDArray) -> NDArray:
             attribute = mesh.GetPrim().GetAttribute(f"{noun}Indices")
             return self.fitting(attribute, f"the {noun}s are left out", partial(read, topology), otherwise)
 
+        def holes(topology: Topology) -> IntArray:
+            faces = self.array(mesh.GetHoleIndicesAttr(), np.int64)
+            return validated_face_indices(topology, faces, "hole", self._source)
+
         rules = {rule: self._rule(rule) for rule in RULE_ATTRIBUTES if rule not in self._rules}
-        uv, data = self._primvars(order, topology, attributes, texcoords)
         is_flat = str(self.value(mesh.GetSubdivisionSchemeAttr())) in FLAT_SCHEMES
+        scheme = None if is_local and is_flat else self._scheme()
+        uv, data = self._primvars(order, topology, attributes, texcoords)
         return CageContents(
             points,
             sizes,
             vertices,
             creases=tags("crease", self._creases, np.zeros((0, 3))),
             corners=tags("corner", self._corners, np.zeros((0, 2))),
-            holes=tags("hole", self._holes, np.zeros(0, np.int64)),
+            holes=tags("hole", holes, np.zeros(0, np.int64)),
             texcoords=uv,
             attributes=data,
             rules=rules,
-            scheme=None if is_local and is_flat else self._scheme(),
+            scheme=scheme,
             source=self._source,
         )
 
@@ -277,11 +280,6 @@ class MeshReader:
             self._tell(f"{self.location}: {noun} at ({numbers}) is ignored; {expected} ({such})", path)
         return rows[is_inside]
 
-    def _holes(self, topology: Topology) -> IntArray:
-        return validated_face_indices(
-            topology, self.array(self.mesh.GetHoleIndicesAttr(), np.int64), "hole", self._source
-        )
-
     def _local_to_world(self) -> NDArray[np.float64]:
         """The transform to world space, as a matrix for row vectors."""
         matrix = np.array(usd_stage.local_to_world(self.mesh.GetPrim(), self._time_of))
@@ -374,8 +372,6 @@ class MeshReader:
                     raise CageError(f"{where} has {len(indices)} values or indices; expected {count}, one per {per}")
                 indices = indices[rows]
             attribute = Attribute(values, "face_varying", indices)
-        if self._is_cage:
-            return attribute
         return validated_attribute(attribute, primvar.GetPrimvarName(), topology, self._source, width=width)
 
 

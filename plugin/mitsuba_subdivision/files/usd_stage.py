@@ -264,8 +264,11 @@ def chosen_meshes(
         return kept or paths
 
     if path == ALL:
-        why = "they are invisible, guides or proxies; expected meshes to be seen"
-        below = without(below, lambda mesh: not _is_shown(mesh, time), why)
+
+        def is_hidden(mesh: UsdGeom.Mesh) -> bool:
+            return mesh.ComputeVisibility(time) == "invisible" or mesh.ComputePurpose() in HIDDEN_PURPOSES
+
+        below = without(below, is_hidden, "they are invisible, guides or proxies; expected meshes to be seen")
     if scheme is None:
         flat, smooth = " or ".join(FLAT_SCHEMES), " or ".join(SCHEMES)
         why = f"their subdivisionScheme is {flat}; expected {smooth}, or a scheme given"
@@ -277,10 +280,6 @@ def chosen_meshes(
             "for all"
         )
     return [meshes[mesh] for mesh in below]
-
-
-def _is_shown(mesh: UsdGeom.Mesh, time: Usd.TimeCode) -> bool:
-    return mesh.ComputeVisibility(time) != "invisible" and mesh.ComputePurpose() not in HIDDEN_PURPOSES
 
 
 def _listed(paths: Iterable[Any], shown: int = 20) -> str:
