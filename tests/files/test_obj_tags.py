@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 from mitsuba_subdivision import CageError, CageWarning, ControlCage
-from mitsuba_subdivision.cage import contents
+from mitsuba_subdivision.cage import Attribute, contents
 from mitsuba_subdivision.cage.contents import same
 from mitsuba_subdivision.cage.named_cages import extraordinary
 from reference.exact_samples import faces_of
@@ -152,10 +152,12 @@ def test_tags_of_what_no_face_has_are_ignored_and_told(read, tag, message, edges
         *({"face_varying": rule} for rule in ("corners_only", "boundaries", "all")),
     ],
 )
-def test_tags_survive_saving(tmp_path, rules):
+def test_tags_and_texture_coordinates_survive_saving(tmp_path, np_rng, rules):
     cage = extraordinary(5, closed=False)
     tags = {"creases": [(0, 1, 0.3), (0, 2, 12)], "corners": [(3, 1 / 3)], "holes": [4, 2]}
-    cage = ControlCage(cage.positions, faces_of(cage), **tags, **rules)
+    corners = len(cage.face_vertices)
+    texcoords = Attribute(np_rng.normal(size=(7, 2)), "face_varying", np_rng.integers(7, size=corners))
+    cage = ControlCage(cage.positions, faces_of(cage), texcoords=texcoords, **tags, **rules)
     cage.save(tmp_path / "cage.obj")
     assert same(ControlCage.from_file(tmp_path / "cage.obj").contents, cage.contents)
 

@@ -48,16 +48,6 @@ def pixels(path):
     return np.array(mi.Bitmap(str(path)))
 
 
-@pytest.mark.usefixtures("folder")
-def test_a_model_is_one_command_and_its_scene_the_next_step(capsys):
-    assert render("cube.obj", "-o", "a.png", "--save-scene", "sub/a.xml", "--cage", *SMALL) == 0
-    assert capsys.readouterr().out == "a.png\n"
-    assert pixels("a.png").shape[:2] == (15, 20)
-    assert render("sub/a.xml", "-o", "b.png", "-m", "scalar_rgb") == 0
-    difference = pixels("a.png").astype(int) - pixels("b.png")
-    assert np.abs(difference).max() <= 1
-
-
 def test_options_of_mitsubas_own_program(folder):
     (folder / "two.xml").write_text(SCENE.format(CONSTANT + SENSOR.format(8) + SENSOR.format(12)))
     threads, level, paths = dr.thread_count(), mi.log_level(), [str(p) for p in mi.file_resolver()]
