@@ -5,7 +5,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision.figures.artifact import ROWS, RULES, surface_of, vertex_normal
+from mitsuba_subdivision.figures.normal_error import ROWS, RULES, surface_of, vertex_normal
 from mitsuba_subdivision.figures.staging import project
 
 SCENES = Path(__file__).parents[2] / "scenes"

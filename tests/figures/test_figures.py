@@ -32,12 +32,11 @@ from mitsuba_subdivision.figures.characteristic import (
 )
 from mitsuba_subdivision.figures.curvature import bent_ball, growth, largest_by_level
 from mitsuba_subdivision.figures.fit import DIAGONAL, ball_cage, distances, in_front
-from mitsuba_subdivision.figures.normal_error import offset_cage
+from mitsuba_subdivision.figures.normal_error import ZOOM_OFFSET, ZOOM_VALENCE, normals_by, offset_cage, panel_samples
 from mitsuba_subdivision.figures.output import write_figure
 from mitsuba_subdivision.figures.scenes import COLUMNS, HIGHEST, LOWEST, ROWS, quilt
 from mitsuba_subdivision.figures.staging import project, visible
 from mitsuba_subdivision.figures.user_cage import around_vertices, frame
-from mitsuba_subdivision.figures.zoom import OFFSET, VALENCE, normals_by, sample
 from mitsuba_subdivision.regression.image import read_channels
 from mitsuba_subdivision.schemes import scheme_named
 from scipy.spatial import cKDTree
@@ -326,9 +325,9 @@ def test_curvature_grows_as_the_eigenvalues_say(valence):
 
 
 def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noqa: ARG001
-    surface = LimitSurface(offset_cage(extraordinary(VALENCE), OFFSET))
+    surface = LimitSurface(offset_cage(extraordinary(ZOOM_VALENCE), ZOOM_OFFSET))
     for magnification, wrong in ((1, 1e-2), (1_000_000, 10)):
-        samples = sample(surface, magnification, 8)
+        samples = panel_samples(surface, magnification, 8)
         # The elements at the point cover the picture, at every magnification.
         extent = np.abs(samples[1][:, -1, :2]).max(axis=1)
         assert extent.min() > 0.9

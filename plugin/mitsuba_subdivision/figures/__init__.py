@@ -58,15 +58,15 @@ FIGURES: dict[str, Figure] = {
     "domains": Figure(
         "characteristic.draw_domains", "parameter domains of the regular patches at each level", ("scheme",), COLUMN
     ),
-    "artifact": Figure("artifact.draw", "normals by (11), (12) and (13), rendered", ("spp", "scheme", "cage")),
-    "error": Figure("normal_error.draw", "normal error against level by (11), (12), (13)", ("cage",)),
+    "artifact": Figure("normal_error.draw_artifact", "normals by (11), (12) and (13)", ("spp", "scheme", "cage")),
+    "error": Figure("normal_error.draw_error", "errors of these normals against level", ("cage",)),
     "schemes": Figure("scenes.draw_schemes", "one cage under the three schemes", ("spp",)),
     "creases": Figure("cages.draw_creases", "one cage with smooth, semi-sharp and sharp creases", ("spp", "cage")),
     "shading": Figure("scenes.draw_shading", "brushed metal, shaded by vertices and exactly at every hit", ("spp",)),
     "displacement": Figure(
         "scenes.draw_displacement", "a jar before and after it is displaced, and its triangles", ("spp",)
     ),
-    "zoom": Figure("zoom.draw", "an extraordinary vertex, magnified up to a million times", ("spp",)),
+    "zoom": Figure("normal_error.draw_zoom", "an extraordinary vertex, magnified up to a million times", ("spp",)),
     "zebra": Figure("zebra.draw", "reflection lines, with exact normals and with others", ("spp", "cage")),
     "curvature": Figure("curvature.draw", "curvature around extraordinary vertices", ("cage",)),
     "fit": Figure("fit.draw", "cages fitted to pictures, and how near they come", ("spp",)),

@@ -1,17 +1,24 @@
-"""Normal error against level for equations (11), (12) and (13), in float32 and float64."""
+"""Normals at extraordinary vertices by equations (11), (12) and (13): rendered, plotted and magnified."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import LogNorm
+from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar  # type: ignore[import-untyped]
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from .. import example_file
 from ..cage import ControlCage
 from ..cage.named_cages import extraordinary
-from ..evaluation.equations import Evaluator
+from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..evaluation.patch_tree import irregular_patch
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import signature_at
@@ -19,9 +26,154 @@ from ..regression.tiers import normal_angle
 from ..schemes import scheme_named
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
-from .output import BETWEEN, SERIES, FigureError, FigureOptions, label_powers, panels, write_figure
+from ..tessellation.vertex_table import Tessellation
+from .cages import edge_curves
+from .characteristic import patch_of_valence
+from .output import BETWEEN, SERIES, FigureError, FigureOptions, label_powers, panels, scientific, show, write_figure
+from .peers import osd_peer, osd_samples
+from .staging import grid_points, grid_triangles, in_8_bits, load_stage, make_mesh, project, render, staged
 from .user_cage import around_vertices, frame
 
+# Vertices within this radius of the extraordinary vertex show their normals, as needles of this length.
+NEEDLE_RADIUS = 0.3
+NEEDLE_LENGTH = 0.07
+# Edges of the cage that begin within this radius of the extraordinary vertex are drawn.
+EDGE_RADIUS = 0.8
+# What lambda_2^n is at the sample of a cage of a user: eps |c1| / lambda_2^n is 30.
+LOST = 2.0**-23 / 3
+# Captions show smaller errors, in degrees, as "below" this: normals of symmetric cages can be right to all digits.
+NEGLIGIBLE = 1e-8
+# By scheme and valence: the u = v at which the extraordinary point is sampled, and the tessellation rate. At |c1| = 10
+# and about these u = v, float32 loses the normal: its error is about eps |c1| / lambda_2^n, where the subdominant
+# eigenvalues are 0.41 and 0.55 (Catmull-Clark), 0.25 and 0.45 (Loop), 0.5 (Doo-Sabin). The smaller these are, the
+# closer to the point lie samples of the same u and v. The rates make the triangles there about equally large.
+ROWS = {
+    ("catmull_clark", 3): (1e-6, 3),
+    ("catmull_clark", 5): (1e-8, 4),
+    ("loop", 3): (1e-4, 2),
+    ("loop", 5): (1e-7, 4),
+    ("doo_sabin", 3): (1e-7, 4),
+    ("doo_sabin", 5): (1e-7, 4),
+}
+# Title, evaluator, and whether samples lie beside the extraordinary point rather than at it; all in float32.
+RULES: tuple[tuple[str, Evaluator, bool], ...] = (
+    ("Stam's form (11)", "stam", True),
+    ("stabilised (12)", "stabilized", True),
+    ("at the point (13)", "stabilized", False),
+)
+
+
+def surface_of(scheme: str, valence: int) -> LimitSurface:
+    """The surface of a scene. Its extraordinary point is corner 0 of element 0, and vertex 0 of a tessellation."""
+    prefix = {"catmull_clark": "valence", "loop": "loop_valence", "doo_sabin": "doo_sabin_face"}[scheme]
+    return LimitSurface(ControlCage.from_file(example_file(f"cages/{prefix}{valence}.obj")), scheme)
+
+
+def vertex_normal(surface: LimitSurface, evaluator: Evaluator, offset: float) -> tuple[int | None, float, float]:
+    """Sample of float32 at ``u = v = offset`` beside an extraordinary point, against float64 there.
+
+    Returns its level n, None at the point itself; the distance |c1| of the point from the origin; and the error of its
+    normal in degrees.
+    """
+    uv = np.full((1, 2), offset)
+    single = surface.evaluate(0, uv, evaluator=evaluator, dtype=np.float32)
+    double = surface.evaluate(0, uv)
+    level = None if single.level[0] == AT_EXTRAORDINARY_POINT else int(single.level[0])
+    limit = surface.evaluate(0, np.zeros((1, 2))).p[0]
+    return level, float(np.linalg.norm(limit)), float(normal_angle(single.n[0], double.n[0]))
+
+
+def draw_artifact(options: FigureOptions) -> list[Path]:
+    """Render valences 3 and 5 with vertex normals by (11), (12) and (13).
+
+    Only the arithmetic of (11) in float32 darkens the first column: scene, light, tessellation and positions are the
+    same in all columns.
+    """
+    if options.cage:
+        rows = _rows_of_user(options.cage, options.scheme)
+    else:
+        of_scheme = [(valence, *sampling) for (scheme, valence), sampling in ROWS.items() if scheme == options.scheme]
+        rows = [(valence, surface_of(options.scheme, valence), offset, rate) for valence, offset, rate in of_scheme]
+    figure, axes = panels(options, len(rows), len(RULES))
+    rendered, records = [], []
+    for (valence, surface, beside, rate), row_axes in zip(rows, axes, strict=True):
+        stage = load_stage(f"valence{5 if options.cage else valence}", resolution=options.resolution)
+        for (title, evaluator, is_beside), axis in zip(RULES, row_axes, strict=True):
+            offset = beside if is_beside else 0.0
+            level, distance, error = vertex_normal(surface, evaluator, offset)
+            location, caption = _caption(offset, level, error)
+            name = f"valence {valence}, {title}"
+            options.report(f"{name}: {location}; {caption}")
+            scene = _scene_of(stage, surface, rate, evaluator, offset)
+            rendered.append(render(scene, options, name)[..., :3])
+            show(axis, in_8_bits(rendered[-1]), caption=f"{location}\n{caption}")
+            _draw_lines(axis, scene, surface, surface.tessellate(rate, evaluator, np.float32, offset))
+            record = {"valence": valence, "rule": title, "level": level, "offset": distance, "error": error}
+            records.append(record)
+        row_axes[0].set_ylabel(f"valence {valence}, |c₁| = {distance:.1f}")
+    for axis, (title, *_) in zip(axes[0], RULES, strict=True):
+        axis.set_title(title)
+    name = options.name_for_scheme("artifact")
+    variant = mi.variant()
+    return write_figure(options, name, figure, rendered, per_row=len(RULES), pictures=records, variant=variant)
+
+
+def _rows_of_user(path: Path, scheme: str) -> list[tuple[int, LimitSurface, float, int]]:
+    """Rows of a user's cage, moved to where the scene of valence 5 has its vertex."""
+    if scheme != "catmull_clark":
+        raise FigureError(f"--cage together with --scheme {scheme}; expected catmull_clark")
+    rows, (_, rate) = [], ROWS[scheme, 5]
+    for valence, cage in around_vertices(path, 2, frame(surface_of(scheme, 5))).items():
+        # Where Stam's form has lost the normal, as above.
+        subdominant = patch_of_valence(scheme_named(scheme), valence).basis.subdominant
+        level = np.log(LOST) / np.log(subdominant)
+        rows.append((valence, LimitSurface(cage, scheme), float(f"{0.5**level:.0e}"), rate))
+    return rows
+
+
+def _caption(sample_offset: float, level: int | None, error: float) -> tuple[str, str]:
+    """Label with the sample location of the vertex and the error of its normal."""
+    location = "u = v = 0" if level is None else f"u = v = {scientific(sample_offset)}, n = {level}"
+    if error >= 0.1:
+        return location, f"error {error:.1f}°"
+    return location, f"error {'below ' * (error < NEGLIGIBLE)}{scientific(max(error, NEGLIGIBLE))}°"
+
+
+def _scene_of(stage: mi.Scene, surface: LimitSurface, rate: int, evaluator: Evaluator, offset: float) -> mi.Scene:
+    """The scene, with a surface in place of its own."""
+    emitters = [shape for shape in stage.shapes() if shape.is_emitter()]
+    shape = {
+        "type": "subdivision",
+        **surface.cage.as_properties(mi),
+        "scheme": surface.scheme.name,
+        "tessellation_rate": rate,
+        "evaluator": evaluator,
+        "sample_offset": offset,
+        "bsdf": next(shape.bsdf() for shape in stage.shapes() if not shape.is_emitter()),
+    }
+    return staged(stage, emitters, surface=mi.load_dict(shape))
+
+
+def _draw_lines(axis: Axes, scene: mi.Scene, surface: LimitSurface, tessellation: Tessellation) -> None:
+    """Draw normals near the extraordinary vertex, and edges of the cage on the surface."""
+    distance = np.linalg.norm(tessellation.positions - tessellation.positions[0], axis=1)
+    near = np.flatnonzero(distance < NEEDLE_RADIUS)
+    start = tessellation.positions[near].astype(np.float64)
+    needles = np.stack([start, start + NEEDLE_LENGTH * tessellation.normals[near]], axis=1)
+    edges = edge_curves(surface, np.arange(surface.patches.elements.half_edge_count), 16)
+    edges = edges[np.linalg.norm(edges[:, 0] - edges[0, 0], axis=1) < EDGE_RADIUS]
+    sensor = scene.sensors()[0]
+    width, height = sensor.film().crop_size()
+    axis.set(xlim=(0, width), ylim=(height, 0))
+    # The needle of the extraordinary vertex comes first.
+    first, *others = project(sensor, needles, width)
+    curves = list(project(sensor, edges, width))
+    axis.add_collection(LineCollection(curves, colors="#40362a", linewidths=0.3, alpha=0.4))
+    axis.add_collection(LineCollection(others, colors="#1c4f72", linewidths=0.6, capstyle="round"))
+    axis.add_collection(LineCollection([first], colors="#d8452a", linewidths=1.5, capstyle="round"))
+
+
+# Of the plot of errors against levels.
 VALENCES = (3, 5)
 OFFSETS = (0, 1, 100)
 LEVELS = np.arange(61)
@@ -35,7 +187,7 @@ PRECISIONS = {np.float32: "-", np.float64: "--"}
 MARKED = 10
 
 
-def draw(options: FigureOptions) -> list[Path]:
+def draw_error(options: FigureOptions) -> list[Path]:
     """Plot the angle between computed and exact normals at every level.
 
     The exact normals come from powers of the subdivision matrix in 60-digit arithmetic.
@@ -87,9 +239,7 @@ def normal_errors(cage: ControlCage, exact: FloatArray, evaluator: Evaluator, dt
     uv = (np.ldexp(1.0, -LEVELS)[:, None, None] * DIRECTIONS).reshape(-1, 2)
     normals = LimitSurface(cage).evaluate(0, uv, evaluator=evaluator, dtype=dtype).n.astype(np.float64)
     # Where derivatives came out parallel or zero, there is no normal. That counts as the largest error.
-    exists = np.abs(normals).max(axis=1) > 0
-    angle = np.full(len(normals), 180.0)
-    angle[exists] = normal_angle(normals[exists], exact[exists])
+    angle = np.nan_to_num(normal_angle(normals, exact), nan=180)
     return angle.reshape(len(LEVELS), -1).max(axis=1)
 
 
@@ -134,3 +284,162 @@ def _rows_to(total: int, matrix: Any) -> Any:
     for i in range(matrix.rows):
         matrix[i, 0] += total - sum(matrix[i, :])
     return matrix
+
+
+# Of the zoom: the surface at a vertex, magnified, with normals by (11), by (12), and by OpenSubdiv where `osd_peer` is.
+ZOOM_VALENCE, ZOOM_OFFSET = 5, 10
+MAGNIFICATIONS = (1, 100, 10_000, 1_000_000)
+Method = Evaluator | Literal["opensubdiv"]
+EVALUATORS: tuple[Evaluator, Evaluator] = ("stam", "stabilized")
+# The deepest level at which OpenSubdiv's patch tables can isolate extraordinary vertices.
+OPENSUBDIV: Literal["opensubdiv"] = "opensubdiv"
+OPENSUBDIV_LEVEL = 10
+LABELS: dict[str, str] = {
+    **{str(evaluator): EQUATIONS[evaluator] for evaluator in EVALUATORS},
+    OPENSUBDIV: f"OpenSubdiv\nlevel {OPENSUBDIV_LEVEL}",
+}
+# Half the width of the image at magnification 1: the elements at the point just fill it. The cage has the radius 1.
+HALF_WIDTH = 0.19
+BAR = 0.1
+# Range of the colours in degrees. Below the least error, float32 cannot tell most unit vectors from the exact ones.
+LEAST_ERROR, MOST_ERROR = 1e-6, 100
+COLOURS, ERROR_SCALE = "YlOrRd", LogNorm(LEAST_ERROR, MOST_ERROR, clip=True)
+LINE_POINTS = 33
+CLAY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.72, 0.66, 0.58]}}
+
+
+def on_stage(surface: LimitSurface, points: NDArray[np.floating], magnification: float) -> NDArray[np.float64]:
+    """Points on the stage, seen along the normal of vertex 0, where the image reaches from -1 to 1."""
+    point, axes, _ = frame(surface)
+    return (points - point) @ axes * (magnification / HALF_WIDTH)
+
+
+def draw_zoom(options: FigureOptions) -> list[Path]:
+    """Draw the neighbourhood of a vertex of valence 5 at four magnifications, with normals by (11) and by (12).
+
+    The left half of each panel is rendered. In the right half, colour shows the angle between the normals and the exact
+    normals: most of these angles are too small for a visible change of shade.
+
+    The surface is sampled anew for every panel. Its normals are evaluated in float32. The positions of the samples come
+    from float64: this far from the origin, float32 cannot tell the points of the last panels apart. OpenSubdiv's
+    normals come from its patch tables (Far), where its program is found.
+    """
+    surface = LimitSurface(offset_cage(extraordinary(ZOOM_VALENCE), ZOOM_OFFSET))
+    stage, resolution = load_stage("zoom", resolution=options.resolution), options.resolution
+    sensor, count = stage.sensors()[0], max(resolution // 2, 8)
+    triangles = grid_triangles(count, ZOOM_VALENCE)
+    rows = (EVALUATORS[0], OPENSUBDIV, EVALUATORS[1]) if osd_peer() else EVALUATORS
+    figure, axes = panels(options, len(rows), len(MAGNIFICATIONS))
+    rendered, records = [], []
+    for magnification, column in zip(MAGNIFICATIONS, axes.T, strict=True):
+        uv, positions, exact = panel_samples(surface, magnification, count)
+        # Of all elements' samples, the one that is nearest to the centre of each pixel, ``(height, width)``.
+        points = positions.reshape(-1, 3)
+        centres = grid_points(np.arange(resolution) + 0.5).reshape(resolution, -1, 2)
+        nearest = np.asarray(cKDTree(project(sensor, points, resolution)).query(centres)[1])
+        lines = project(sensor, _level_lines(surface, magnification), resolution)
+        for evaluator, axis in zip(rows, column, strict=True):
+            normals, errors, median = normals_by(surface, uv, positions, exact, evaluator)
+            mesh = make_mesh(points, triangles, CLAY, normals=(normals @ frame(surface)[1]).reshape(-1, 3))
+            name = f"{LABELS[evaluator]}, x {magnification}".replace("\n", ", ")
+            options.report(f"{name}: median normal error {median:.1e} degrees")
+            rendered.append(render(staged(stage, mesh=mesh), options, name))
+            _draw_halves(axis, rendered[-1], errors.ravel()[nearest], lines)
+            axis.set_xlabel(_degrees(median))
+            # The length of the scale bar is one on the surface, whose cage has the radius 1.
+            length = BAR / HALF_WIDTH / 2 * resolution
+            bar = AnchoredSizeBar(axis.transData, length, scientific(BAR / magnification), "lower left", pad=0.2, sep=2)
+            bar.patch.set(alpha=0.85, linewidth=0)
+            axis.add_artist(bar)
+            records.append({"evaluator": evaluator, "magnification": magnification, "error": median})
+        column[0].set_title(f"× {scientific(magnification)}\nu, v < {scientific(parameter_extent(magnification))}")
+    for axis, evaluator in zip(axes[:, 0], rows, strict=True):
+        axis.set_ylabel(LABELS[evaluator])
+    scale = ScalarMappable(ERROR_SCALE, COLOURS)
+    colours = figure.colorbar(scale, ax=axes, fraction=0.03, pad=0.01, aspect=45, extend="both")
+    colours.set_label("error of the normal in degrees; medians below panels")
+    label_powers(colours.ax.yaxis)
+    strips = [pixels for i in range(len(rows)) for pixels in rendered[i :: len(rows)]]
+    count = len(MAGNIFICATIONS)
+    return write_figure(options, "zoom", figure, strips, per_row=count, pictures=records, offset=ZOOM_OFFSET)
+
+
+def parameter_extent(magnification: float) -> float:
+    """Largest u and v that a panel shows: distances from the point are proportional to ``u ** -log2(lambda_2)``."""
+    patch = patch_of_valence(scheme_named("catmull_clark"), ZOOM_VALENCE)
+    return float(magnification ** (1 / np.log2(patch.basis.subdominant)))
+
+
+def panel_samples(surface: LimitSurface, magnification: float, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sample a grid of ``count`` segments along each side in every element at the point, as far as a panel shows.
+
+    Returns parameters ``(s, 2)``, the same in each element; and positions on the stage and normals of exact arithmetic,
+    ``(valence, s, 3)`` each.
+    """
+    uv = grid_points(np.linspace(0, 1, count + 1))
+    # Stam's form has no value at the point itself.
+    uv[0] = 0.1 / count
+    uv *= parameter_extent(magnification)
+    exact = surface.evaluate(np.arange(ZOOM_VALENCE)[:, None], uv)
+    shape = ZOOM_VALENCE, len(uv), 3
+    return uv, on_stage(surface, exact.p, magnification).reshape(shape), exact.n.reshape(shape)
+
+
+def normals_by(
+    surface: LimitSurface,
+    # As `panel_samples` returns them
+    uv: FloatArray,
+    positions: FloatArray,
+    exact: FloatArray,
+    evaluator: Method,
+) -> tuple[FloatArray, FloatArray, float]:
+    """Normals by one of our evaluators or by OpenSubdiv, both in float32, ``(valence, s, 3)``.
+
+    Returns besides their angles to the exact normals in degrees ``(valence, s)``, and the median of those inside the
+    image.
+    """
+    elements = np.arange(ZOOM_VALENCE)[:, None]
+    if evaluator == OPENSUBDIV:
+        program = osd_peer()
+        if program is None:
+            raise FigureError("the program osd_peer is gone; expected it where it was found before")
+        normals = osd_samples(program, surface.cage, elements, uv, "far", OPENSUBDIV_LEVEL)[1]
+    else:
+        normals = surface.evaluate(elements, uv, evaluator=evaluator, dtype=np.float32).n.astype(np.float64)
+    normals = np.nan_to_num(normals).reshape(exact.shape)
+    # Where derivatives are parallel or vanish, there is no normal. That counts as the largest error.
+    angle = np.where(normals.any(axis=-1), normal_angle(normals, exact), 180)
+    inside = np.abs(positions[..., :2]).max(axis=-1) < 1
+    return normals, angle, float(np.median(angle[inside]))
+
+
+def _level_lines(surface: LimitSurface, magnification: float) -> NDArray[np.float64]:
+    """Edges of the elements at the point and of their children, on the stage: ``(lines, points, 3)``."""
+    along = np.linspace(0, 1, LINE_POINTS)
+    line = np.stack([np.ones_like(along), along], axis=1)
+    extent = parameter_extent(magnification)
+    # The lines u = 1/2^n and v = 1/2^n of every level n that the image resolves.
+    first = int(np.floor(-np.log2(extent))) - 1
+    curves = []
+    for level in range(max(first, 0), first + 7):
+        curves += [line * 2.0**-level, line[:, ::-1] * 2.0**-level]
+    curves.append(np.stack([along, np.zeros_like(along)], axis=1) * extent)
+    points = surface.evaluate(np.arange(ZOOM_VALENCE)[:, None], np.concatenate(curves)).p
+    return on_stage(surface, points, magnification).reshape(-1, LINE_POINTS, 3)
+
+
+def _draw_halves(axis: Axes, pixels: NDArray[np.float32], errors: FloatArray, lines: FloatArray) -> None:
+    """Draw a rendered image, errors in degrees over its right half, and lines in pixels over both."""
+    height, width = errors.shape
+    axis.imshow(in_8_bits(pixels), interpolation="lanczos")
+    right = (width // 2, width, height, 0)
+    axis.imshow(errors[:, width // 2 :], cmap=COLOURS, norm=ERROR_SCALE, interpolation="nearest", extent=right)
+    axis.add_collection(LineCollection(list(lines), colors="black", linewidths=0.3, alpha=0.6))
+    axis.axvline(width / 2, color="white")
+    axis.set(xlim=(0, width), ylim=(height, 0), xticks=[], yticks=[])
+
+
+def _degrees(error: float) -> str:
+    if error < LEAST_ERROR:
+        return f"< {scientific(LEAST_ERROR)}°"
+    return f"{scientific(error)}°" if error < 0.01 else f"{error:.1g}°" if error < 1 else f"{error:.0f}°"
