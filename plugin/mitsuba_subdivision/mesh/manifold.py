@@ -107,13 +107,10 @@ def _has_single_fans(topology: Topology) -> bool:
 
 
 def fan_labels(topology: Topology) -> tuple[IntArray, NDArray[np.bool_]]:
-    """Label the fan of each face corner.
+    """Label the fan of each face corner: ``(n_h,)`` a label that is equal for corners of one fan only.
 
-    Uses pointer doubling: after ``r`` rounds each corner covers the next ``2**r`` corners counter-clockwise, so the
-    number of rounds is logarithmic in the number of faces of a vertex.
-
-    Returns (n_h,) int, a label that is equal for corners of one fan only, and (n_h,) bool, true at one corner of each
-    fan.
+    Also returns ``(n_h,)``, true at one corner of each fan. Uses pointer doubling: after ``r`` rounds each corner
+    covers the next ``2**r`` corners counter-clockwise.
     """
     corners = np.arange(topology.half_edge_count)
     jump = topology.turn.copy()

@@ -38,17 +38,9 @@ def crease_masks(
 ) -> tuple[FloatArray, FloatArray, tuple[IntArray, IntArray, FloatArray], FloatArray]:
     """Compute the masks of all vertices and edges of a mesh: a factor of the scheme's smooth masks, and more weights.
 
-    Returns
-    -------
-    smooth : (n_v,) float64
-        Factor of the scheme's smooth mask in the mask of each vertex.
-    at_vertex : (n_v,) float64
-        Further weight of the vertex itself.
-    of_neighbours : (m,) int64, (m,) int64, (m,) float64
-        Further weights in the mask of a vertex of one of its neighbours: vertex, neighbour and weight.
-    midpoint : (n_h,) float64
-        Factor of the midpoint in the edge point of each half-edge; that of the scheme's smooth mask is one minus this.
-        Equal for both half-edges of an edge, 1 on borders.
+    Returns, for each vertex, the factor of the smooth mask, and a further weight of the vertex itself; further weights
+    of neighbours, as vertices, neighbours and weights; and for each half-edge, the factor of the midpoint in the edge
+    point. That of the smooth mask is one minus this. It is equal for both half-edges of an edge, and 1 on borders.
     """
     t, semi = topology, topology.semi_sharpness
     border = t.twin < 0

@@ -246,15 +246,10 @@ class UniformGrid:
         return np.concatenate([cells, strip[_cut_cells(count, 2)], [[count**2 - 1, beyond[-1], beyond[-1] + 1]]])
 
     def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
-        """Parameters at the corners of an element's triangles.
+        """``(T, 3, 2)`` parameters at the corners of a whole element's triangles, which start at its first corner.
 
-        Returns
-        -------
-        whole : (T, 3, 2) float64
-            Triangles of a whole element; parameters start at its first corner.
-        corner : (T, 3, 2) float64
-            Triangles of one corner of any other element; parameters start at that corner. Some triangles may reach
-            beyond u = 1, into the patch of the next corner.
+        And those of one corner of any other element, which start at that corner. Some triangles may reach beyond u = 1,
+        into the patch of the next corner.
         """
         whole = (self._steps / self.rate)[self._whole_cells]
         if self.domain.corner_count == 3:
@@ -283,14 +278,9 @@ class UniformGrid:
         """The grids of the patches that begin at ``corners``, which are all in whole elements or all not.
 
         ``are_corners`` tells that whole elements have patches at their corners, too, which meet at their centres.
-
-        Returns
-        -------
-        uv : (S, 2) float64
-            Parameters of the samples of a patch, starting at the corner at which the patch begins.
-        parts : list of GridPart
-            Parts that together contain every vertex that these patches evaluate exactly once. Patches are numbered in
-            the order of ``corners``.
+        Returns the parameters of a patch's samples, ``(S, 2)``, starting at the corner at which the patch begins; and
+        parts that together contain every vertex that these patches evaluate exactly once. Patches are numbered in the
+        order of ``corners``.
         """
         t, r = self.topology, self.rate
         face = t.face[corners]
@@ -363,14 +353,9 @@ class UniformGrid:
         return uv, [part._replace(uv=part.uv / 2) for part in parts]
 
     def locations(self) -> tuple[IntArray, FloatArray]:
-        """Locations of the vertices on the surface.
+        """Locations of the vertices on the surface: half-edges of `PatchTable.elements`, and parameters ``(n, 2)``.
 
-        Returns
-        -------
-        half_edge : (vertex_count,) int64
-            Corner of an element at which the parameters are (0, 0), a half-edge of `PatchTable.elements`.
-        uv : (vertex_count, 2) float64
-            Parameters. Vertices at corners of elements have (0, 0).
+        At the corner of an element at which a half-edge begins, parameters are (0, 0).
         """
         t = self.topology
         half_edge, uv = np.zeros(self.vertex_count, dtype=np.int64), np.zeros((self.vertex_count, 2))
