@@ -18,14 +18,13 @@ from pathlib import Path
 import mitsuba_subdivision
 
 # isort: split
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.device_arrays import upload
+from mitsuba_subdivision.kernels.locations import TriangleLocations
 from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
 from mitsuba_subdivision.tessellation.criterion import Criterion, Measure, Sensor
-from mitsuba_subdivision.tessellation.uniform_grid import UniformGrid
 from mitsuba_subdivision.tessellation.vertex_table import VertexTable
 from scipy.spatial import cKDTree
 
@@ -63,55 +62,32 @@ def main() -> None:
         if name in WITH_OUTLINES:
             outlines, asked = Outlines(surface), COARSEST
             error = outlines.error(uniform)
-            while (found := outlines.error(adaptive := outlines.adaptive(asked))) > error:
+            while (reached := outlines.error(adaptive := outlines.adaptive(asked))) > error:
                 asked *= FINER
-            report(f"{name}, outline", uniform, error, adaptive, found)
+            report(f"{name}, outline", uniform, error, adaptive, reached)
 
 
-def report(name: str, uniform: VertexTable, error: float, adaptive: VertexTable, found: float) -> None:
+def report(name: str, uniform: VertexTable, error: float, adaptive: VertexTable, reached: float) -> None:
     many, few = len(uniform.triangles), len(adaptive.triangles)
-    sides = f"{many:8} triangles {error:.5f}   {few:8} triangles {found:.5f}"
+    sides = f"{many:8} triangles {error:.5f}   {few:8} triangles {reached:.5f}"
     print(f"{name:<18} {sides} {many / few:8.2f}", flush=True)
 
 
 def chord_error(surface: LimitSurface, table: VertexTable) -> float:
     """Largest distance of points of triangles from the surface; from below, as no other points are looked at."""
     positions, _ = table.apply(surface.cage.positions)
-    corner, uv = locations(surface, table)
-    i, j = (each.ravel() for each in np.indices((STEPS + 1, STEPS + 1)))
+    i, j = (index.ravel() for index in np.indices((STEPS + 1, STEPS + 1)))
     inside = (i + j <= STEPS) & (np.max([i, j, STEPS - i - j], axis=0) < STEPS)
     weights = np.stack([i, j, STEPS - i - j], axis=1)[inside] / STEPS
-    kernel, float64 = surface.on_device("llvm_ad_rgb_double"), dr.llvm.ad.Float64
-    element, found = surface.patches.elements.face[corner], []
-    corner = corner - surface.patches.elements.face_offsets[element]
-    for begin in range(0, len(corner), TRIANGLES_AT_ONCE):
-        own = slice(begin, begin + TRIANGLES_AT_ONCE)
-        points, starts = (weights @ positions[table.triangles[own]]).T, (weights @ uv[own]).T
-        p = kernel.types.vector3(*(upload(float64, each.T.ravel()) for each in points))
-        starts = tuple(upload(float64, each.T.ravel()) for each in starts)
-        places = (np.repeat(each[own], len(weights)) for each in (element, corner))
-        elements, corners = (upload(dr.llvm.ad.UInt32, each) for each in places)
-        found.append(np.array(kernel.closest(p, elements, starts, corners).distance).max())
-    return max(found)
-
-
-def locations(surface: LimitSurface, table: VertexTable) -> tuple[np.ndarray, np.ndarray]:
-    """A corner of its element for each triangle, and parameters of the triangle's corners as seen from there."""
-    if not isinstance(table.grid, UniformGrid):
-        corner, uv = table.grid.triangle_locations
-        return corner.astype(np.int64), uv
-    whole, partial = table.grid.triangle_parameters()
-    counts, element = table.grid.triangle_counts, table.element.astype(np.int64)
-    place = np.arange(len(element)) - (np.cumsum(counts) - counts)[element]
-    is_whole = surface.patches.is_whole[element]
-    corner, uv = surface.patches.elements.face_offsets[element].astype(np.int64), np.empty((len(element), 3, 2))
-    uv[is_whole] = whole[place[is_whole]]
-    if len(partial):
-        turn, own = np.divmod(place[~is_whole], len(partial))
-        corner[~is_whole] += turn
-        # Some reach beyond the corner that they belong to.
-        uv[~is_whole] = np.clip(partial[own], 0, 1)
-    return corner, uv
+    kernel, distances = surface.on_device("llvm_ad_rgb_double"), []
+    types, location_of = kernel.types, TriangleLocations(table, kernel.walk, kernel.types)
+    for begin in range(0, len(table.triangles), TRIANGLES_AT_ONCE):
+        triangles = np.arange(begin, min(begin + TRIANGLES_AT_ONCE, len(table.triangles)))
+        points = (weights @ positions[table.triangles[triangles]]).reshape(-1, 3)
+        b1, b2 = np.tile(weights[:, 1:], (len(triangles), 1)).T
+        start = location_of(types.indices(np.repeat(triangles, len(weights))), types.floats(b1), types.floats(b2))
+        distances.append(np.array(kernel.closest(upload(types.vector3, points), start).distance).max())
+    return max(distances)
 
 
 class Outlines:

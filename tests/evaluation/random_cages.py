@@ -45,10 +45,10 @@ def flipped(points, faces, move):
         new = np.linalg.det(points[[a, d, c]]), np.linalg.det(points[[b, c, d]])
         return valence[[a, b]].min() > 3 and tuple(sorted((c, d))) not in edges and min(new) > LEAST_VOLUME
 
-    found = [edge for edge in sorted(edges) if allowed(*edge)]
-    if not found:
+    candidates = [edge for edge in sorted(edges) if allowed(*edge)]
+    if not candidates:
         return faces
-    a, b = found[move % len(found)]
+    a, b = candidates[move % len(candidates)]
     (first, c), (second, d) = across[a, b], across[b, a]
     faces = list(faces)
     faces[first], faces[second] = (a, d, c), (b, c, d)
@@ -59,7 +59,7 @@ def dissolved(faces, move):
     """Two faces made one across the ``move``-th edge that is all they share, and whose ends keep valence 3."""
     across = {(f[i - 1], f[i]): k for k, f in enumerate(faces) for i in range(len(f))}
     valence = np.bincount(np.concatenate(faces))
-    found = [
+    candidates = [
         (a, b)
         for a, b in sorted(across)
         if a < b
@@ -67,9 +67,9 @@ def dissolved(faces, move):
         and len({*faces[across[a, b]]} & {*faces[across[b, a]]}) == 2
         and len(faces[across[a, b]]) + len(faces[across[b, a]]) <= 8
     ]
-    if not found:
+    if not candidates:
         return faces
-    a, b = found[move % len(found)]
+    a, b = candidates[move % len(candidates)]
     left, right = across[a, b], across[b, a]
     # From b along the left face to a, then from a along the right one to b.
     left_path, right_path = (

@@ -213,12 +213,12 @@ def test_flat_islands_keep_their_coordinates(triangles, mode, np_rng):
     given = tagged(cage, corners=corners, face_varying=mode, texcoords=values)
     surface = LimitSurface(given, "loop" if triangles else "catmull_clark")
     element, uv, corner = random_locations(surface, np_rng)
-    found = surface.evaluate_attribute("texcoords", element, uv, corner)
+    values_here = surface.evaluate_attribute("texcoords", element, uv, corner)
     start = t.face_offsets[element] + corner
     origin, u, v = (flat[cage.face_vertices[h]] for h in (start, t.next[start], t.prev[start]))
     at = origin + uv[:, :1] * (u - origin) + uv[:, 1:] * (v - origin)
     expected = np.where(island[start][:, None], moved(at), at)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=20 * ROUNDING)
+    np.testing.assert_allclose(values_here, expected, rtol=0, atol=20 * ROUNDING)
 
 
 @pytest.mark.parametrize("method", ["uniform", "chaikin"])
@@ -240,8 +240,8 @@ def test_an_island_is_the_surface_of_its_own_faces(scheme, method, np_rng):
     arrays = cage.positions[kept], cage.face_sizes[faces], vertices.ravel()
     alone = LimitSurface(ControlCage.from_arrays(*arrays, creases=own, crease_method=method), scheme)
     element, uv, corner = random_locations(alone, np_rng)
-    found = surface.evaluate_attribute("p", faces[element], uv, corner)
-    np.testing.assert_allclose(found, alone.evaluate(element, uv, corner).p, rtol=0, atol=2 * ROUNDING)
+    values_here = surface.evaluate_attribute("p", faces[element], uv, corner)
+    np.testing.assert_allclose(values_here, alone.evaluate(element, uv, corner).p, rtol=0, atol=2 * ROUNDING)
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -368,8 +368,8 @@ def test_linear_values_are_bilinear_over_each_face(scheme, cage, np_rng):
             a, b, c, d = ring[0], (ring[0] + ring[1]) / 2, ring.mean(axis=0), (ring[0] + ring[-1]) / 2
         expected.append((1 - u) * (1 - v) * a + u * (1 - v) * b + u * v * c + (1 - u) * v * d)
     for name in ("texcoords", "varying"):
-        found = surface.evaluate_attribute(name, element, uv, corner)
-        np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING)
+        values_here = surface.evaluate_attribute(name, element, uv, corner)
+        np.testing.assert_allclose(values_here, expected, rtol=0, atol=ROUNDING)
 
 
 def test_a_constant_stays_one(np_rng):

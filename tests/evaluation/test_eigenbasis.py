@@ -15,7 +15,7 @@ VALENCES = [3, 4, 5, 6, 8, 12, 50, 100]
 RESIDUAL = 5e-13
 # Computed eigenvalues of all valences lie this close to their closed forms; measured 2e-15 (plugin/MATHEMATICS.md).
 EIGENVALUE = 1e-14
-# A defective eigenvalue is found within the square root of the machine precision, times the condition of the basis.
+# A defective eigenvalue is known within the square root of the machine precision, times the condition of the basis.
 DEFECTIVE_EIGENVALUE = 1e-7
 # The powers of a block come from its own entries, not from its eigenvalue, and so keep what the basis keeps.
 POWER = 1e-10

@@ -57,8 +57,8 @@ def test_scaled_powers_of_a_defective_matrix_match_mpmath(case, level):
         limit = exact**512
         scaled = (exact**level - limit) / mpmath.mpf(basis.subdominant) ** level
         expected = np.array(scaled.tolist(), dtype=float)
-    found = times_powers(basis.vectors[None], np.full(len(matrix), level), basis, basis.subdominant)[0] @ basis.inverse
-    assert np.abs(found - expected).max() < DERIVATIVE
+    powers = times_powers(basis.vectors[None], np.full(len(matrix), level), basis, basis.subdominant)[0] @ basis.inverse
+    assert np.abs(powers - expected).max() < DERIVATIVE
 
 
 @pytest.mark.parametrize(
@@ -67,16 +67,16 @@ def test_scaled_powers_of_a_defective_matrix_match_mpmath(case, level):
 def test_deep_samples_match_explicit_refinement(scheme, valence):
     """Where the power of a Jordan block has grown by a factor of some hundred over that of its eigenvalue, too."""
     exact = samples_at(scheme, valence, DEEP)
-    found = LimitSurface(exact.cage, scheme).evaluate(0, exact.uv, derivatives=2)
-    assert found.level.max() >= max(DEEP)
-    assert_exact(found, exact, curvature_levels=np.inf)
+    samples = LimitSurface(exact.cage, scheme).evaluate(0, exact.uv, derivatives=2)
+    assert samples.level.max() >= max(DEEP)
+    assert_exact(samples, exact, curvature_levels=np.inf)
 
 
 def test_points_near_valence_2_match_explicit_refinement():
     exact = samples_at("catmull_clark", 2)
-    found = LimitSurface(exact.cage).evaluate(0, np.concatenate([exact.uv, [[0.0, 0.0]]]))
-    assert np.abs(found.p - np.concatenate([exact.p, [exact.limit_p]])).max() <= POINT * exact.size
-    assert angle(found.n[:-1], exact.n).max() <= NORMAL
+    samples = LimitSurface(exact.cage).evaluate(0, np.concatenate([exact.uv, [[0.0, 0.0]]]))
+    assert np.abs(samples.p - np.concatenate([exact.p, [exact.limit_p]])).max() <= POINT * exact.size
+    assert angle(samples.n[:-1], exact.n).max() <= NORMAL
 
 
 def test_normal_at_valence_2_is_that_of_the_subdominant_eigenvectors():
@@ -93,13 +93,13 @@ def test_valence_2_has_one_limit_from_both_sides():
     cage = bumpy(cube_with_valence_2(), 1)
     around = np.flatnonzero(cage.face_vertices == 8)
     assert len(around) == 2
-    found = evaluate_from(LimitSurface(cage), around, [[0.0, 0.0]])
-    assert np.abs(found.p[0] - found.p[1]).max() <= POINT
-    assert angle(found.n[0], found.n[1]) <= NORMAL
+    samples = evaluate_from(LimitSurface(cage), around, [[0.0, 0.0]])
+    assert np.abs(samples.p[0] - samples.p[1]).max() <= POINT
+    assert angle(samples.n[0], samples.n[1]) <= NORMAL
     face = int(cage.topology.face[around[0]])
     at_vertex = face, int(around[0] - cage.topology.face_offsets[face])
     near = BruteForce("catmull_clark", cage.positions, faces_of(cage)).evaluate(*at_vertex, 2.0**-60, 0)
-    assert np.abs(found.p[0] - np.array(near.p, dtype=float)).max() <= POINT
+    assert np.abs(samples.p[0] - np.array(near.p, dtype=float)).max() <= POINT
 
 
 def test_loop_at_valence_2_is_what_refinement_comes_to():

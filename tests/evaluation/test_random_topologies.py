@@ -9,10 +9,10 @@ FEW = 60
 
 
 def test_surfaces_of_random_topologies_agree_with_those_of_their_refined_cages():
-    found = [topologies.outcome(seed) for seed in range(FEW)]
-    wrong = [(seed, result) for seed, (result, _) in enumerate(found) if not result.startswith(("ok", "refused"))]
+    outcomes = [topologies.outcome(seed) for seed in range(FEW)]
+    wrong = [(seed, result) for seed, (result, _) in enumerate(outcomes) if not result.startswith(("ok", "refused"))]
     assert wrong == []
-    compared = [differences for _, differences in found if differences is not None]
+    compared = [differences for _, differences in outcomes if differences is not None]
     assert len(compared) > FEW / 2
     # Some of them collapse, and most do not.
     assert 0 < sum(differences.zero > 0 for differences in compared) < len(compared) / 2
@@ -34,20 +34,20 @@ def test_random_faces_are_manifold_and_of_every_kind():
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
-        (lambda found: {"p": found.p + 1e-9}, "points differ by"),
-        (lambda found: {"n": found.n @ np.array([(1, 1e-6, 0), (-1e-6, 1, 0), (0, 0, 1)])}, "normals differ by"),
-        (lambda found: {"n": 0.999 * found.n}, "normals neither unit nor zero"),
-        (lambda found: {"n": np.nan * found.n}, "normals neither unit nor zero"),
-        (lambda found: {"n": 0 * found.n}, "normals zero on one side only"),
+        (lambda samples: {"p": samples.p + 1e-9}, "points differ by"),
+        (lambda samples: {"n": samples.n @ np.array([(1, 1e-6, 0), (-1e-6, 1, 0), (0, 0, 1)])}, "normals differ by"),
+        (lambda samples: {"n": 0.999 * samples.n}, "normals neither unit nor zero"),
+        (lambda samples: {"n": np.nan * samples.n}, "normals neither unit nor zero"),
+        (lambda samples: {"n": 0 * samples.n}, "normals zero on one side only"),
     ],
 )
-def test_wrong_points_and_normals_are_found(change, problem, monkeypatch):
+def test_wrong_points_and_normals_are_noticed(change, problem, monkeypatch):
     surface = LimitSurface(ControlCage(np.random.default_rng(1).random((4, 3)), topologies.SEEDS[4]))
     evaluate_at = topologies.evaluate_at
 
-    def changed(of, *samples):
-        found = evaluate_at(of, *samples)
-        return found._replace(**change(found)) if of is surface else found
+    def changed(of, *where):
+        samples = evaluate_at(of, *where)
+        return samples._replace(**change(samples)) if of is surface else samples
 
     monkeypatch.setattr(topologies, "evaluate_at", changed)
     assert problem in topologies.differences_to_refined(surface, np.random.default_rng(2)).problem

@@ -99,9 +99,9 @@ def test_a_users_scheme_works_in_a_scene(variant_scalar_rgb):  # noqa: ARG001
 
 def test_a_scheme_may_state_every_rule_itself_and_be_used_without_registering():
     cage = extraordinary(4)
-    found = LimitSurface(cage, Bilinear()).evaluate(0, [[0.25, 0.5]])
+    samples = LimitSurface(cage, Bilinear()).evaluate(0, [[0.25, 0.5]])
     a, b, c, d = cage.positions[cage.face_vertices[:4]]
-    assert np.abs(found.p[0] - (0.375 * a + 0.125 * b + 0.125 * c + 0.375 * d)).max() < POINT
+    assert np.abs(samples.p[0] - (0.375 * a + 0.125 * b + 0.125 * c + 0.375 * d)).max() < POINT
 
 
 class TooWide(Warren):

@@ -4,7 +4,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from gradients.estimates import ERRORS, MEANS_SOMETHING, Estimate, Pictures, along, gradients
+from gradients.estimates import ERRORS, MEANS_SOMETHING, Pictures, along, gradients
 from gradients.outlines import RATE, SURFACES, change, covered, properties
 from gradients.scenes import POINTS, outline
 from gradients.surfaces import motions
@@ -99,13 +99,6 @@ def test_emitters_with_exact_shading_have_no_black_rims():
     np.testing.assert_array_equal(image, flat)
     # Rims are half a per cent of what shines.
     assert smooth.mean() < 0.997 * flat.mean()
-
-
-def test_estimates_state_their_error():
-    values = Estimate(np.array([1.0, 2.0, 3.0, 6.0]))
-    assert values.mean == 3
-    assert values.error == pytest.approx(np.sqrt(14 / 3 / 4))
-    assert (values - values).error == 0
 
 
 def test_scan_lines_measure_what_they_should():

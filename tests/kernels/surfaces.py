@@ -89,6 +89,18 @@ def kernel_named(name, variant, evaluator="stabilized"):
     return surface_named(name).on_device(variant, evaluator)
 
 
+def grid_locations(surface, segments):
+    """A grid of parameters on every patch, and the corner of an element that each is seen from."""
+    elements, domain = surface.patches.elements, surface.scheme.domain
+    j, i = np.indices((segments + 1, segments + 1)).reshape(2, -1)
+    inside = i + j <= segments if domain.corner_count == 3 else np.full(len(i), True)
+    uv = np.stack([i, j], axis=1)[inside] / segments
+    corner = np.arange(elements.half_edge_count)
+    is_first = corner == elements.face_offsets[elements.face[corner]]
+    starts = corner[is_first | ~surface.patches.is_whole[elements.face[corner]]]
+    return np.repeat(starts, len(uv)), np.tile(uv, (len(starts), 1))
+
+
 def random_locations(surface, rng, count, deepest=23):
     """Element, parameters and corner: all over the elements, and down to 2^-deepest at every corner."""
     elements, domain = surface.patches.elements, surface.scheme.domain
@@ -105,15 +117,15 @@ def on_device(types, element, uv, corner):
     return types.indices(element), upload(types.vector2, uv), types.indices(corner)
 
 
-def vectors(found):
+def vectors(array):
     """``(s, 3)`` numbers of 3-vectors."""
-    return np.array(dr.detach(found)).T.astype(np.float64)
+    return np.array(dr.detach(array)).T.astype(np.float64)
 
 
-def computed(found):
+def computed(results):
     """Samples or hits, computed by one kernel."""
-    dr.eval(found)
-    return found
+    dr.eval(results)
+    return results
 
 
 def hit(kernel, o, d, *start):
@@ -137,4 +149,4 @@ def aimed(surface, rng, count, *, steep=0.3, near=0.05, deepest=4):
     beyond = np.maximum(domain.extent(start) - 1, 0)[:, None]
     start = np.clip(start - beyond, 0, 1)
     o, d = target.p - rng.uniform(0.5, 3, (count, 1)) * d, rng.uniform(0.5, 2, (count, 1)) * d
-    return target.p[kept], o[kept], d[kept], [each[kept] for each in (element, start, corner)]
+    return target.p[kept], o[kept], d[kept], [values[kept] for values in (element, start, corner)]

@@ -19,8 +19,8 @@ def test_only_zero_has_no_unit_vector(variant_llvm_ad_rgb, np_rng):  # noqa: ARG
     directions /= np.linalg.norm(directions, axis=0)
     # Squares vanish at one end, and overflow at the other.
     lengths = 10.0 ** np.linspace(-35, 35, 20)
-    found = np.array(unit(upload(mi.Vector3f, (directions * lengths).T)))
-    np.testing.assert_allclose(found, directions, atol=ROUNDING)
+    units = np.array(unit(upload(mi.Vector3f, (directions * lengths).T)))
+    np.testing.assert_allclose(units, directions, atol=ROUNDING)
     np.testing.assert_array_equal(np.array(unit(mi.Vector3f(0, -0.0, 0))).ravel(), 0)
     # The inverse of the smallest numbers is infinite.
     for length in (np.inf, 1e-39, 1e-45):
@@ -35,13 +35,13 @@ def test_a_row_is_where_it_was_written_and_derivatives_return_to_it(size, varian
     rows = np.arange(ROW_COUNT * size, dtype=np.float64).reshape(ROW_COUNT, size) + 1
     buffer = types.floats(rows)
     index, active = np_rng.integers(0, ROW_COUNT, 20), np_rng.random(20) < 0.7
-    found = types.row(buffer, size, types.indices(index), upload(mi.Mask, active))
-    np.testing.assert_array_equal(np.array(found).T, rows[index] * active[:, None])
+    row = types.row(buffer, size, types.indices(index), upload(mi.Mask, active))
+    np.testing.assert_array_equal(np.array(row).T, rows[index] * active[:, None])
 
     dr.enable_grad(buffer)
     weights = np_rng.integers(1, 5, (size, 20)).astype(np.float32)
-    found = types.row(buffer, size, types.indices(index))
-    dr.backward(dr.sum(sum(number * upload(mi.Float, weight) for number, weight in zip(found, weights, strict=True))))
+    row = types.row(buffer, size, types.indices(index))
+    dr.backward(dr.sum(sum(number * upload(mi.Float, weight) for number, weight in zip(row, weights, strict=True))))
     expected = np.zeros((ROW_COUNT, size))
     np.add.at(expected, index, weights.T)
     np.testing.assert_array_equal(np.array(dr.grad(buffer)).reshape(ROW_COUNT, size), expected)

@@ -60,9 +60,9 @@ def evaluated(surface, name, variant, element, uv, corner):
     """``(s, k)`` value, and derivatives by u and v."""
     kernel = kernel_of(surface, variant)
     types, channel = kernel.types, ChannelKernel(surface.channel(name), float_type_of(variant))
-    found = channel(kernel.walk.at(types.indices(element), *map(types.floats, uv.T), types.indices(corner)))
-    dr.eval(found)
-    return [np.array(each).astype(np.float64).reshape(-1, len(element)).T for each in found]
+    results = channel(kernel.walk.at(types.indices(element), *map(types.floats, uv.T), types.indices(corner)))
+    dr.eval(results)
+    return [np.array(result).astype(np.float64).reshape(-1, len(element)).T for result in results]
 
 
 @pytest.mark.core
@@ -72,10 +72,10 @@ def test_values_are_the_channels(surface, variant, np_rng):
     # On edges, where elements on both sides of a seam have values of their own; and at corners.
     locations[1][:100, 1] = locations[1][:20] = 0
     for name in surface.attribute_names:
-        found, *_ = evaluated(surface, name, variant, *locations)
+        values, *_ = evaluated(surface, name, variant, *locations)
         expected = surface.evaluate_attribute(name, *locations)
-        assert found.shape == expected.shape
-        np.testing.assert_allclose(found, expected, rtol=0, atol=ROUNDING[variant])
+        assert values.shape == expected.shape
+        np.testing.assert_allclose(values, expected, rtol=0, atol=ROUNDING[variant])
 
 
 @pytest.mark.core
@@ -87,8 +87,8 @@ def test_values_by_linear_rules_are_the_channels(surface, np_rng):
     locations = random_locations(surface, np_rng, 600)
     for name in ("varying 1", "seams 2"):
         assert surface.channel(name).layout.is_linear
-        found, *_ = evaluated(surface, name, DOUBLE, *locations)
-        np.testing.assert_allclose(found, surface.evaluate_attribute(name, *locations), rtol=0, atol=ROUNDING[DOUBLE])
+        values, *_ = evaluated(surface, name, DOUBLE, *locations)
+        np.testing.assert_allclose(values, surface.evaluate_attribute(name, *locations), rtol=0, atol=ROUNDING[DOUBLE])
 
 
 def test_derivatives_are_differences(surface, np_rng):
@@ -98,7 +98,7 @@ def test_derivatives_are_differences(surface, np_rng):
     kept = (domain.inside(uv) > 0.01) & (np.abs(uv % 0.25 - 0.125).max(axis=1) < 0.12)
     element, uv, corner = element[kept], uv[kept], corner[kept]
     for name in surface.attribute_names:
-        _, *found = evaluated(surface, name, DOUBLE, element, uv, corner)
-        for derivative, step in zip(found, STEP * np.eye(2), strict=True):
-            ahead, behind = (surface.evaluate_attribute(name, element, uv + each, corner) for each in (step, -step))
+        _, *derivatives = evaluated(surface, name, DOUBLE, element, uv, corner)
+        for derivative, step in zip(derivatives, STEP * np.eye(2), strict=True):
+            ahead, behind = (surface.evaluate_attribute(name, element, uv + shift, corner) for shift in (step, -step))
             np.testing.assert_allclose(derivative, (ahead - behind) / (2 * STEP), rtol=0, atol=DIFFERENCES)

@@ -31,17 +31,17 @@ ON_RAY = {DOUBLE: 2e-6, SINGLE: 5e-6}
 def test_rays_meet_the_points_that_they_are_aimed_at(name, variant, np_rng):
     surface, kernel = surface_named(name), kernel_named(name, variant)
     target, o, d, start = aimed(surface, np_rng, 1000)
-    found = hit(kernel, o, d, *start)
-    t, p = np.array(found.t).astype(float), vectors(found.p)
+    hits = hit(kernel, o, d, *start)
+    t, p = np.array(hits.t).astype(float), vectors(hits.p)
     met = np.isfinite(t)
     assert met.mean() > 0.99
     assert np.linalg.norm(o + t[:, None] * d - p, axis=1)[met].max() <= ON_RAY[variant]
     # A few rays meet another part of the surface that is as near.
     assert (np.linalg.norm(p - target, axis=1)[met] <= 10 * ON_RAY[variant]).mean() > 0.99
-    # The location that is found is where the point lies.
-    again = kernel.at(found.location)
+    # The location of a hit is where the point lies.
+    again = kernel.at(hits.location)
     np.testing.assert_allclose(vectors(again.p), p, rtol=0, atol=POINT[variant])
-    inside = surface.scheme.domain.inside(np.array([found.location.u, found.location.v]).T)
+    inside = surface.scheme.domain.inside(np.array([hits.location.u, hits.location.v]).T)
     assert inside.min() >= 0
 
 
@@ -69,11 +69,11 @@ def test_lines_past_a_border_lead_to_the_border(variant, beyond):
     surface, kernel = surface_named("sheet without corners"), kernel_named("sheet without corners", variant)
     p, location, kind, values = met_past_a_border(kernel, surface, beyond)
     assert (np.array(kind) == ON_NORMAL).all()
-    found = kernel.at(location)
-    np.testing.assert_allclose(vectors(values.value), vectors(found.p), rtol=0, atol=POINT[variant])
+    there = kernel.at(location)
+    np.testing.assert_allclose(vectors(values.value), vectors(there.p), rtol=0, atol=POINT[variant])
     inside = surface.scheme.domain.inside(np.array([location.u, location.v]).T)
     np.testing.assert_allclose(inside, 0, rtol=0, atol=ON_RAY[variant])
-    assert np.linalg.norm(vectors(found.p) - p, axis=1).max() <= 1.5 * beyond + ON_RAY[variant]
+    assert np.linalg.norm(vectors(there.p) - p, axis=1).max() <= 1.5 * beyond + ON_RAY[variant]
 
 
 @pytest.mark.core
@@ -102,16 +102,16 @@ def test_rays_meet_points_next_to_extraordinary_ones_in_single_precision(cage, s
     corner = half_edge - t.face_offsets[element]
     uv = np_rng.random((500, 2)) * 2.0**-depth
     target = surface.evaluate(element, uv, corner)
-    found = hit(kernel, target.p + 0.1 * target.n, -target.n, element, uv, corner)
-    assert np.isfinite(np.array(found.t)).mean() > 0.98
+    hits = hit(kernel, target.p + 0.1 * target.n, -target.n, element, uv, corner)
+    assert np.isfinite(np.array(hits.t)).mean() > 0.98
 
     start = np.clip(uv + np_rng.uniform(-0.02, 0.02, uv.shape), 0, 1)
     d = -target.n + np_rng.uniform(-0.5, 0.5, (500, 3))
-    found = hit(kernel, target.p - 2 * d, d, element, start, corner)
-    met = np.isfinite(np.array(found.t))
+    hits = hit(kernel, target.p - 2 * d, d, element, start, corner)
+    met = np.isfinite(np.array(hits.t))
     # A few wander between pieces until they are given up.
     assert met.mean() > 0.97
-    np.testing.assert_allclose(vectors(found.p)[met], target.p[met], rtol=0, atol=10 * ON_RAY[SINGLE])
+    np.testing.assert_allclose(vectors(hits.p)[met], target.p[met], rtol=0, atol=10 * ON_RAY[SINGLE])
 
 
 @pytest.mark.core
@@ -125,10 +125,10 @@ def test_rays_past_a_convex_surface_meet_nothing(variant, np_rng):
     d = along[:, 0] * s.dp_du + along[:, 1] * s.dp_dv
     d /= np.linalg.norm(d, axis=1)[:, None]
     for height, are_met in ((0.05, False), (-0.05, True)):
-        found = hit(kernel, s.p + height * s.n - 2 * d, d, element, uv, corner)
-        met = np.isfinite(np.array(found.t))
-        assert np.isfinite(vectors(found.p)).all()
-        assert np.isfinite(vectors(found.n)).all()
+        hits = hit(kernel, s.p + height * s.n - 2 * d, d, element, uv, corner)
+        met = np.isfinite(np.array(hits.t))
+        assert np.isfinite(vectors(hits.p)).all()
+        assert np.isfinite(vectors(hits.n)).all()
         # Grazing rays may be given up.
         assert met.mean() > 0.9 if are_met else not met.any()
 

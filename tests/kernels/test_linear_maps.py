@@ -28,14 +28,14 @@ def test_weighted_values_and_derivatives_are_products(float_type, rounding, weig
     for is_forward in (False, True):
         flat = upload(float_type, values)
         dr.enable_grad(flat)
-        found = matrix(flat, size)
-        np.testing.assert_allclose(np.array(dr.detach(found)), (weights @ values).ravel(), rtol=0, atol=rounding)
+        products = matrix(flat, size)
+        np.testing.assert_allclose(np.array(dr.detach(products)), (weights @ values).ravel(), rtol=0, atol=rounding)
         if is_forward:
             dr.set_grad(flat, upload(float_type, change))
-            dr.forward_to(found)
-            np.testing.assert_allclose(np.array(dr.grad(found)), (weights @ change).ravel(), rtol=0, atol=rounding)
+            dr.forward_to(products)
+            np.testing.assert_allclose(np.array(dr.grad(products)), (weights @ change).ravel(), rtol=0, atol=rounding)
         else:
-            dr.backward(dr.sum(found * upload(float_type, gradient)))
+            dr.backward(dr.sum(products * upload(float_type, gradient)))
             expected = (weights.T @ gradient).ravel()
             np.testing.assert_allclose(np.array(dr.grad(flat)), expected, rtol=0, atol=10 * rounding)
 
@@ -51,11 +51,11 @@ def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, roundin
     values.set(given)
     assert values.are_moving
     assert values.flat is flat
-    found = dr.gather(types.vector3, values.flat, types.index(5))
-    np.testing.assert_allclose(np.array(dr.detach(found)).ravel(), (weights @ second)[5], rtol=0, atol=rounding)
-    dr.backward(found.x)
-    found = np.array(dr.grad(given)).reshape(-1, 3)
-    np.testing.assert_allclose(found, weights.toarray()[5][:, None] * [1, 0, 0], rtol=0, atol=rounding)
+    row = dr.gather(types.vector3, values.flat, types.index(5))
+    np.testing.assert_allclose(np.array(dr.detach(row)).ravel(), (weights @ second)[5], rtol=0, atol=rounding)
+    dr.backward(row.x)
+    gradient = np.array(dr.grad(given)).reshape(-1, 3)
+    np.testing.assert_allclose(gradient, weights.toarray()[5][:, None] * [1, 0, 0], rtol=0, atol=rounding)
 
 
 def test_equal_values_share_what_is_made_of_them_until_they_are_set(float_type, rounding, weights, np_rng):
@@ -67,7 +67,7 @@ def test_equal_values_share_what_is_made_of_them_until_they_are_set(float_type, 
     kept = np.array(second.flat)
     assert first.flat is not second.flat
     assert first.flat.index == second.flat.index
-    assert len({each.flat.index for each in (first, other, apart)}) == 3
+    assert len({known.flat.index for known in (first, other, apart)}) == 3
     first.set(upload(float_type, 2 * values))
     np.testing.assert_array_equal(second.flat, kept)
     np.testing.assert_allclose(np.array(first.flat), 2 * kept, rtol=0, atol=2 * rounding)

@@ -116,7 +116,7 @@ def as_seen_from_first(surface, half_edge, uv):
     elements, domain = surface.patches.elements, surface.scheme.domain
     face = elements.face[half_edge]
     turns = np.where(surface.patches.is_whole[face], half_edge - elements.face_offsets[face], 0)
-    turned = np.array([domain.rotation(int(turn))(each) for turn, each in zip(turns, uv, strict=True)])
+    turned = np.array([domain.rotation(int(turn))(place) for turn, place in zip(turns, uv, strict=True)])
     return half_edge - turns, turned
 
 

@@ -34,9 +34,9 @@ def points_near(surface, count, np_rng, away=0.03):
 
 
 def closest(kernel, points, *start):
-    found = kernel.closest(upload(kernel.types.vector3, points), *on_device(kernel.types, *start))
-    dr.eval(found)
-    return found
+    nearest = kernel.closest(upload(kernel.types.vector3, points), *on_device(kernel.types, *start))
+    dr.eval(nearest)
+    return nearest
 
 
 @EVERY_KIND
@@ -48,11 +48,11 @@ def test_nearest_points_are_minima_from_places_beside_them(name, np_rng):
     uv = np.where(expected.uv > 0.45, expected.uv, uv)
     # Both against one search, which takes longer than they do.
     for variant, bar in BARS.items():
-        found = closest(kernel_named(name, variant), points, expected.element, uv, expected.corner)
-        distance = np.array(found.distance, dtype=np.float64)
+        nearest = closest(kernel_named(name, variant), points, expected.element, uv, expected.corner)
+        distance = np.array(nearest.distance, dtype=np.float64)
         assert (distance >= expected.distance - bar * size).all(), variant
         assert (distance <= expected.distance + bar * size).mean() >= SAME, variant
-        away = np.linalg.norm(points - vectors(found.p), axis=1)
+        away = np.linalg.norm(points - vectors(nearest.p), axis=1)
         np.testing.assert_allclose(distance, away, rtol=0, atol=bar * size, err_msg=variant)
 
 
@@ -61,13 +61,13 @@ def test_locations_of_results_start_the_next_call(np_rng):
     _, points = points_near(surface, 40, np_rng)
     near = surface.closest_point(points)
     points, place = upload(kernel.types.vector3, points), on_device(kernel.types, near.element, near.uv, near.corner)
-    found = kernel.closest(points, *place)
-    again = kernel.closest(points, found.location)
-    there = kernel.evaluate(found.location)
-    dr.eval(found, again, there)
-    np.testing.assert_allclose(vectors(again.p), vectors(found.p), rtol=0, atol=1e-9)
-    np.testing.assert_array_equal(vectors(there.p), vectors(found.p))
-    for arguments in ((found.location, place[1]), (place[0],)):
+    nearest = kernel.closest(points, *place)
+    again = kernel.closest(points, nearest.location)
+    there = kernel.evaluate(nearest.location)
+    dr.eval(nearest, again, there)
+    np.testing.assert_allclose(vectors(again.p), vectors(nearest.p), rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(vectors(there.p), vectors(nearest.p))
+    for arguments in ((nearest.location, place[1]), (place[0],)):
         with pytest.raises(TypeError, match="expected a location alone, or an element and uv"):
             kernel.evaluate(*arguments)
 
@@ -79,8 +79,8 @@ def test_minima_on_borders_are_found(name, np_rng):
     size, points = points_near(surface, 150, np_rng, 0.3)
     points += np_rng.normal(size=points.shape) * 0.3 * size
     expected, middle = surface.closest_point(points), np.full((150, 2), 1 / 3)
-    found = closest(kernel_named(name, DOUBLE), points, expected.element, middle, expected.corner)
-    distance = np.array(found.distance)
+    nearest = closest(kernel_named(name, DOUBLE), points, expected.element, middle, expected.corner)
+    distance = np.array(nearest.distance)
     assert (distance >= expected.distance - BARS[DOUBLE] * size).all()
     # Others are minima of their own: the surfaces bend.
     assert (distance <= expected.distance + 1e-6 * size).mean() > 0.8
@@ -93,8 +93,8 @@ def test_nearest_points_on_every_side_of_a_triangle(turn):
     surface = LimitSurface(ControlCage(positions, np.roll([[0, 1, 2]], turn, axis=1)), "loop")
     outside = 2 * (0.6 * positions + 0.4 * np.roll(positions, 1, axis=0)) - positions.mean(axis=0)
     start = np.zeros(3, dtype=int), np.full((3, 2), 0.3), np.zeros(3, dtype=int)
-    found = closest(surface.on_device(DOUBLE), outside, *start)
-    np.testing.assert_allclose(np.array(found.distance), surface.closest_point(outside).distance, rtol=1e-6)
+    nearest = closest(surface.on_device(DOUBLE), outside, *start)
+    np.testing.assert_allclose(np.array(nearest.distance), surface.closest_point(outside).distance, rtol=1e-6)
 
 
 # Few, as the derivatives of each surface are compiled for itself, which takes up to 13 s.
@@ -108,20 +108,20 @@ def test_derivatives_follow_nearest_points(name, np_rng):
     locations = expected.element, expected.uv, expected.corner
     moves, ways = np_rng.normal(size=positions.shape), np_rng.normal(size=points.shape)
 
-    def found_at(step):
+    def nearest_at(step):
         kernel.set_control_points(types.floats((positions + step * moves).ravel()))
-        found = closest(kernel, points + step * ways, *locations)
-        return [vectors(found.p), vectors(found.n), np.array(found.distance)]
+        nearest = closest(kernel, points + step * ways, *locations)
+        return [vectors(nearest.p), vectors(nearest.n), np.array(nearest.distance)]
 
-    differences = [(a - b) / (2 * STEP) for a, b in zip(found_at(STEP), found_at(-STEP), strict=True)]
+    differences = [(a - b) / (2 * STEP) for a, b in zip(nearest_at(STEP), nearest_at(-STEP), strict=True)]
     control_points, targets = types.floats(positions.ravel()), upload(types.vector3, points)
     dr.enable_grad(control_points, targets)
     dr.set_grad(control_points, types.floats(moves.ravel()))
     dr.set_grad(targets, upload(types.vector3, ways))
     kernel.set_control_points(control_points)
-    found = kernel.closest(targets, *on_device(types, *locations))
+    nearest = kernel.closest(targets, *on_device(types, *locations))
     # Derivatives are taken off what is on the way to others.
-    p, n, distance = dr.forward_to([found.p * 1, found.n * 1, found.distance * 1])
+    p, n, distance = dr.forward_to([nearest.p * 1, nearest.n * 1, nearest.distance * 1])
     dr.eval(p, n, distance)
     for one, other in zip((vectors(p), vectors(n), np.array(distance)), differences, strict=True):
         np.testing.assert_allclose(one, other, rtol=DIFFERENCES, atol=DIFFERENCES)
@@ -129,9 +129,9 @@ def test_derivatives_follow_nearest_points(name, np_rng):
 
 def drawn_points(kernel, count, np_rng):
     one, *pair = map(kernel.types.floats, np_rng.random((3, count)))
-    found = kernel.sample(one, kernel.types.vector2(*pair))
-    dr.eval(found)
-    return found
+    drawn = kernel.sample(one, kernel.types.vector2(*pair))
+    dr.eval(drawn)
+    return drawn
 
 
 @pytest.mark.parametrize("name", KINDS[::2])
@@ -140,12 +140,12 @@ def test_random_points_lie_in_their_elements_and_densities_weigh_them(name):
     surface = surface_named(name)
     area, others = surface.area(), surface.sample(COUNT, 5).p
     for variant in BARS:
-        found = drawn_points(kernel_named(name, variant), COUNT, np.random.default_rng(0))
-        weight = 1 / np.array(found.pdf, dtype=np.float64)
+        drawn = drawn_points(kernel_named(name, variant), COUNT, np.random.default_rng(0))
+        weight = 1 / np.array(drawn.pdf, dtype=np.float64)
         assert abs(weight.mean() - area) <= ERRORS * weight.std() / COUNT**0.5 + 1e-5 * area, variant
-        location = found.location
+        location = drawn.location
         assert surface.scheme.domain.inside(np.array([location.u, location.v]).T).min() >= -ROUNDED[variant], variant
-        moments, expected = weight[:, None] * vectors(found.p), area * others
+        moments, expected = weight[:, None] * vectors(drawn.p), area * others
         error = np.hypot(moments.std(axis=0), expected.std(axis=0)) / COUNT**0.5
         off = np.abs(moments.mean(axis=0) - expected.mean(axis=0))
         assert (off <= ERRORS * error + 1e-5 * area).all(), variant

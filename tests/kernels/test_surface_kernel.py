@@ -63,17 +63,17 @@ def evaluated(kernel, *locations, derivatives=1):
     return computed(kernel.evaluate(*on_device(kernel.types, *locations), derivatives=derivatives))
 
 
-def assert_same(found, expected, bars):
+def assert_same(samples, expected, bars):
     """Points, normals and tangents of a kernel are those of the surface."""
-    np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=bars["point"])
+    np.testing.assert_allclose(vectors(samples.p), expected.p, rtol=0, atol=bars["point"])
     # At extraordinary points, tangents have arbitrary length.
     has_derivatives = expected.level != AT_EXTRAORDINARY_POINT
     # The cross product of tangents loses as many digits as their angle is small.
     u, v = expected.dp_du, expected.dp_dv
     sine = np.linalg.norm(np.cross(u, v), axis=1) / np.linalg.norm(u, axis=1) / np.linalg.norm(v, axis=1)
-    lost = np.linalg.norm(vectors(found.n) - expected.n, axis=1) * np.where(has_derivatives, sine, 1)
+    lost = np.linalg.norm(vectors(samples.n) - expected.n, axis=1) * np.where(has_derivatives, sine, 1)
     assert lost.max() <= bars["normal"]
-    for one, other in ((found.dp_du, expected.dp_du), (found.dp_dv, expected.dp_dv)):
+    for one, other in ((samples.dp_du, expected.dp_du), (samples.dp_dv, expected.dp_dv)):
         relative = np.linalg.norm(vectors(one) - other, axis=1) / np.linalg.norm(other, axis=1)
         assert relative[has_derivatives].max() <= bars["derivative"]
 
@@ -94,8 +94,8 @@ def test_points_tangents_and_normals_are_the_surfaces(name, np_rng):
 def test_normals_of_a_collapsed_surface_do_not_turn(shape, np_rng):
     kernel = LimitSurface(cube().with_positions(cube().positions * shape)).on_device(SINGLE)
     locations = random_locations(surface_named("cube"), np_rng, 20, deepest=1)
-    found = evaluated(kernel, *locations, derivatives=2)
-    for derivative in (found.dn_du, found.dn_dv):
+    samples = evaluated(kernel, *locations, derivatives=2)
+    for derivative in (samples.dn_du, samples.dn_dv):
         np.testing.assert_array_equal(vectors(derivative), 0)
 
 
@@ -111,9 +111,9 @@ def test_normals_at_borders_are_exact_in_single_precision_down_to_the_vertex(nam
     element, uv, corner = random_locations(surface, np_rng, 4000, deepest=22)
     beside = cut.is_border_vertex[cut.face_vertices[elements.face_offsets[element] + corner]] & (uv.max(axis=1) < 0.1)
     locations = element[beside], uv[beside], corner[beside]
-    found, expected = evaluated(kernel_named(name, SINGLE), *locations), surface.evaluate(*locations)
+    samples, expected = evaluated(kernel_named(name, SINGLE), *locations), surface.evaluate(*locations)
     assert expected.level.max() > 18
-    np.testing.assert_allclose(vectors(found.n), expected.n, rtol=0, atol=BORDER_NORMAL)
+    np.testing.assert_allclose(vectors(samples.n), expected.n, rtol=0, atol=BORDER_NORMAL)
 
 
 @pytest.mark.parametrize("name", ["hexagon", "valence 2", "half disc of 6", "corner", "loop half disc of 6"])
@@ -125,14 +125,14 @@ def test_normals_are_those_of_corners_only_where_points_are(name, np_rng):
     surface = surface_named(name)
     element, uv, corner = random_locations(surface, np_rng, 8000)
     uv = (uv * 2.0 ** -np_rng.uniform(0, 100, (8000, 1))).astype(np.float32).astype(float)
-    found = evaluated(kernel_named(name, SINGLE), element, uv, corner)
+    samples = evaluated(kernel_named(name, SINGLE), element, uv, corner)
     expected, at_corner = surface.evaluate(element, uv, corner), surface.evaluate(element, 0 * uv, corner)
-    differs = np.linalg.norm(vectors(found.n) - expected.n, axis=1) > BARS[SINGLE]["normal"]
+    differs = np.linalg.norm(vectors(samples.n) - expected.n, axis=1) > BARS[SINGLE]["normal"]
     assert differs.any()
-    np.testing.assert_allclose(vectors(found.n)[differs], at_corner.n[differs], rtol=0, atol=BORDER_NORMAL)
+    np.testing.assert_allclose(vectors(samples.n)[differs], at_corner.n[differs], rtol=0, atol=BORDER_NORMAL)
     size = np.ptp(surface.cage.positions, axis=0).max()
     assert np.linalg.norm(expected.p - at_corner.p, axis=1)[differs].max() <= ONE_POINT * size
-    np.testing.assert_allclose(vectors(found.p), expected.p, rtol=0, atol=BARS[SINGLE]["point"])
+    np.testing.assert_allclose(vectors(samples.p), expected.p, rtol=0, atol=BARS[SINGLE]["point"])
 
 
 @pytest.mark.core
@@ -140,10 +140,10 @@ def test_normals_are_those_of_corners_only_where_points_are(name, np_rng):
 def test_derivatives_of_normals_are_those_of_the_surface(name, np_rng):
     surface = surface_named(name)
     locations = random_locations(surface, np_rng, 500, deepest=4)
-    found = evaluated(kernel_named(name, DOUBLE), *locations, derivatives=2)
+    samples = evaluated(kernel_named(name, DOUBLE), *locations, derivatives=2)
     s = surface.evaluate(*locations, derivatives=2)
     area = np.linalg.norm(np.cross(s.dp_du, s.dp_dv), axis=1)[:, None]
-    for derivative, of_u, of_v in ((found.dn_du, s.d2p_duu, s.d2p_duv), (found.dn_dv, s.d2p_duv, s.d2p_dvv)):
+    for derivative, of_u, of_v in ((samples.dn_du, s.d2p_duu, s.d2p_duv), (samples.dn_dv, s.d2p_duv, s.d2p_dvv)):
         change = (np.cross(of_u, s.dp_dv) + np.cross(s.dp_du, of_v)) / area
         across = change - s.n * (change * s.n).sum(axis=1)[:, None]
         scale = np.abs(across).max(axis=1) + np.linalg.norm(of_u, axis=1) / np.linalg.norm(s.dp_du, axis=1)
@@ -158,9 +158,9 @@ def test_a_cage_refined_once_has_the_same_surface(monkeypatch, np_rng):
     locations = random_locations(surface, np_rng, 500)
     # On the lines between quarters, too.
     locations[1][:20, 0] = 0.5
-    found, expected = evaluated(refined.on_device(DOUBLE), *locations), surface.evaluate(*locations)
-    assert_same(found, expected, BARS[DOUBLE])
-    np.testing.assert_allclose(vectors(found.n), expected.n, rtol=0, atol=BARS[DOUBLE]["normal"])
+    samples, expected = evaluated(refined.on_device(DOUBLE), *locations), surface.evaluate(*locations)
+    assert_same(samples, expected, BARS[DOUBLE])
+    np.testing.assert_allclose(vectors(samples.n), expected.n, rtol=0, atol=BARS[DOUBLE]["normal"])
 
 
 @pytest.mark.parametrize("levels", [0, PIECE_LEVELS - 1])
@@ -181,8 +181,8 @@ def test_a_scheme_of_a_user_is_evaluated(np_rng):
 
     known = surface_named("hexagon")
     locations = random_locations(known, np_rng, 200)
-    found = evaluated(LimitSurface(known.cage, OfAUser()).on_device(DOUBLE), *locations)
-    assert_same(found, known.evaluate(*locations), BARS[DOUBLE])
+    samples = evaluated(LimitSurface(known.cage, OfAUser()).on_device(DOUBLE), *locations)
+    assert_same(samples, known.evaluate(*locations), BARS[DOUBLE])
 
 
 # Stam's form
@@ -193,15 +193,15 @@ def test_stams_form_is_the_same_but_for_rounding_which_takes_its_normals_in_sing
     locations = random_locations(surface, np_rng, 500, deepest=5)
     expected = surface.evaluate(*locations)
     for variant, bar in ((DOUBLE, FIRST_TERM), (SINGLE, 1e-4)):
-        found = evaluated(kernel_named("valence 3", variant, "stam"), *locations)
-        np.testing.assert_allclose(vectors(found.n), expected.n, rtol=0, atol=bar)
+        samples = evaluated(kernel_named("valence 3", variant, "stam"), *locations)
+        np.testing.assert_allclose(vectors(samples.n), expected.n, rtol=0, atol=bar)
 
     uv = np.ldexp(np.random.default_rng(1).random((200, 2)) / 2 + 0.25, -18).astype(np.float32).astype(float)
     element = np.zeros(200, dtype=int)
     expected, lost = surface.evaluate(element, uv), {}
     for evaluator in ("stam", "stabilized"):
-        found = evaluated(kernel_named("valence 3", SINGLE, evaluator), element, uv, 0 * element)
-        lost[evaluator] = np.linalg.norm(vectors(found.n) - expected.n, axis=1)
+        samples = evaluated(kernel_named("valence 3", SINGLE, evaluator), element, uv, 0 * element)
+        lost[evaluator] = np.linalg.norm(vectors(samples.n) - expected.n, axis=1)
     assert np.median(lost["stam"]) > 1e-3
     assert lost["stabilized"].max() < 1e-6
 
@@ -225,11 +225,11 @@ def small_surface(name):
 
 def forward(outputs, inputs, changes):
     """Changes of outputs, from those of inputs."""
-    for each, change in zip(inputs, changes, strict=True):
-        dr.set_grad(each, change)
+    for value, change in zip(inputs, changes, strict=True):
+        dr.set_grad(value, change)
     dr.enqueue(dr.ADMode.Forward, *inputs)
     dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearNone)
-    return [np.array(each).T for each in computed([dr.grad(output) for output in outputs])]
+    return [np.array(gradient).T for gradient in computed([dr.grad(output) for output in outputs])]
 
 
 def assert_differentiated(outputs_of, inputs, changes, differences, rng, kept=..., rtol=0, atol=DIFFERENCES):
@@ -240,17 +240,17 @@ def assert_differentiated(outputs_of, inputs, changes, differences, rng, kept=..
         assert np.abs(one).max() > 0.1
         scale = max(1, np.abs(other[kept]).max())
         np.testing.assert_allclose(one[kept], other[kept], rtol=rtol, atol=atol * scale)
-    seeds = [rng.normal(size=each.shape) for each in forwards]
+    seeds = [rng.normal(size=derivative.shape) for derivative in forwards]
     dr.clear_grad(inputs)
     outputs = outputs_of()
     for output, seed in zip(outputs, seeds, strict=True):
         dr.set_grad(output, upload(type(output), seed))
     dr.enqueue(dr.ADMode.Backward, *outputs)
     dr.traverse(dr.ADMode.Backward)
-    gradients = computed([dr.grad(each) for each in inputs])
+    gradients = computed([dr.grad(value) for value in inputs])
     products = np.concatenate([(f * s).ravel() for f, s in zip(forwards, seeds, strict=True)])
-    found = sum((np.array(c) * np.array(g)).sum() for c, g in zip(changes, gradients, strict=True))
-    assert abs(found - products.sum()) <= BARS[DOUBLE]["point"] * np.abs(products).sum()
+    product = sum((np.array(c) * np.array(g)).sum() for c, g in zip(changes, gradients, strict=True))
+    assert abs(product - products.sum()) <= BARS[DOUBLE]["point"] * np.abs(products).sum()
 
 
 @pytest.mark.parametrize("by", ["points", "parameters", "rays"])
@@ -267,7 +267,7 @@ def test_derivatives_of_derivatives_of_normals_are_differences(by, np_rng):
     values = {"points": positions, "parameters": uv, "rays": o}
     direction = types.floats(np_rng.normal(size=values[by].size))
 
-    def found(step):
+    def samples_at(step):
         flat = {name: types.floats(value.ravel()) for name, value in values.items()}
         flat[by] = flat[by] + step * direction
         p, w, origin = flat.values()
@@ -280,9 +280,11 @@ def test_derivatives_of_derivatives_of_normals_are_differences(by, np_rng):
 
     step = types.floats(0)
     dr.enable_grad(step)
-    at = found(step)
+    at = samples_at(step)
     (change,) = forward([at.dn_du + 2 * at.dn_dv], [step], [types.floats(1)])
-    ends = [vectors(each.dn_du + 2 * each.dn_dv) for each in (found(types.floats(STEP)), found(types.floats(-STEP)))]
+    ends = [
+        vectors(end.dn_du + 2 * end.dn_dv) for end in (samples_at(types.floats(STEP)), samples_at(types.floats(-STEP)))
+    ]
     difference = (ends[0] - ends[1]) / (2 * STEP)
     assert np.abs(difference).max() > 0.1
     np.testing.assert_allclose(change, difference, rtol=0, atol=THIRD * np.abs(difference).max())
@@ -295,17 +297,17 @@ def test_derivatives_by_control_points_are_differences_and_the_same_both_ways(na
     locations = random_locations(surface, np_rng, 60, deepest=10)
     positions, direction = surface.cage.positions, np_rng.normal(size=surface.cage.positions.shape)
 
-    def samples(step):
+    def moved(step):
         s = LimitSurface(surface.cage.with_positions(positions + step * direction), surface.scheme).evaluate(*locations)
         return s.p, s.n, s.dp_du
 
-    differences = [(a - b) / (2 * STEP) for a, b in zip(samples(STEP), samples(-STEP), strict=True)]
+    differences = [(a - b) / (2 * STEP) for a, b in zip(moved(STEP), moved(-STEP), strict=True)]
     points = kernel.types.floats(positions.ravel())
 
     def outputs():
         kernel.set_control_points(points)
-        found = kernel.evaluate(*on_device(kernel.types, *locations))
-        return found.p, found.n, found.dp_du
+        samples = kernel.evaluate(*on_device(kernel.types, *locations))
+        return samples.p, samples.n, samples.dp_du
 
     assert_differentiated(outputs, [points], [kernel.types.floats(direction.ravel())], differences, np_rng)
 
@@ -339,8 +341,8 @@ def test_placed_normals_turn_as_the_placed_surface_does(np_rng):
     def at(u, v):
         return kernel.evaluate(3, (u, v), derivatives=2).placed(to_world)
 
-    found, step = at(0.3, 0.2), 1e-5
-    for turn, du, dv in ((found.dn_du, step, 0), (found.dn_dv, 0, step)):
+    samples, step = at(0.3, 0.2), 1e-5
+    for turn, du, dv in ((samples.dn_du, step, 0), (samples.dn_dv, 0, step)):
         ahead, behind = (vectors(at(0.3 + side * du, 0.2 + side * dv).n) for side in (1, -1))
         difference = (ahead - behind) / (2 * step)
         np.testing.assert_allclose(vectors(turn), difference, rtol=0, atol=1e-8 * np.abs(difference).max())
@@ -354,31 +356,31 @@ def test_derivatives_of_hits_are_differences_and_the_same_both_ways(name, np_rng
     types, vector3 = kernel.types, kernel.types.vector3
     _, o, d, start = aimed(surface, np_rng, 80, near=0.02)
     # From where they meet the surface: then nothing but rounding is left after three more steps.
-    found = hit(kernel, o, d, *start).location
-    half_edge, first = np.array(found.half_edge), surface.patches.elements.face_offsets
+    at = hit(kernel, o, d, *start).location
+    half_edge, first = np.array(at.half_edge), surface.patches.elements.face_offsets
     element = np.searchsorted(first, half_edge, side="right") - 1
-    locations = on_device(types, element, np.array([found.u, found.v]).T, half_edge - first[element])
+    locations = on_device(types, element, np.array([at.u, at.v]).T, half_edge - first[element])
     values = surface.cage.positions, o, d
-    directions = [np_rng.normal(size=each.shape) for each in values]
+    directions = [np_rng.normal(size=value.shape) for value in values]
 
     def met(step):
-        points, *ray = (each + step * direction for each, direction in zip(values, directions, strict=True))
+        points, *ray = (value + step * direction for value, direction in zip(values, directions, strict=True))
         kernel.set_control_points(types.floats(points.ravel()))
-        found = computed(kernel.intersect(rays_of(types, *ray), *locations))
-        return vectors(found.p), vectors(found.n), np.array(found.t)
+        hits = computed(kernel.intersect(rays_of(types, *ray), *locations))
+        return vectors(hits.p), vectors(hits.n), np.array(hits.t)
 
     differences = [(a - b) / (2 * STEP) for a, b in zip(met(STEP), met(-STEP), strict=True)]
     is_hit = np.isfinite(met(0)[2])
     assert is_hit.mean() > 0.95
     inputs = [types.floats(values[0].ravel()), upload(vector3, o), upload(vector3, d)]
 
-    def hits():
+    def outputs():
         kernel.set_control_points(inputs[0])
-        found = kernel.intersect(SimpleNamespace(o=inputs[1], d=inputs[2]), *locations)
-        return found.p, found.n, found.t
+        hits = kernel.intersect(SimpleNamespace(o=inputs[1], d=inputs[2]), *locations)
+        return hits.p, hits.n, hits.t
 
-    changes = [types.floats(directions[0].ravel()), *(upload(vector3, each) for each in directions[1:])]
-    assert_differentiated(hits, inputs, changes, differences, np_rng, is_hit, STEEP, HIT_DIFFERENCES)
+    changes = [types.floats(directions[0].ravel()), *(upload(vector3, direction) for direction in directions[1:])]
+    assert_differentiated(outputs, inputs, changes, differences, np_rng, is_hit, STEEP, HIT_DIFFERENCES)
 
 
 # What can be wrong
@@ -389,9 +391,9 @@ def test_control_points_and_places_have_any_natural_form_but_no_other_number():
     p, expected = moved.positions, LimitSurface(moved).evaluate(1, [[0.3, 0.4]], 2)
     tensor, point = upload(dr.llvm.ad.TensorXf, p), upload(kernel.types.vector3, p)
     forms = [p, p.ravel(), p.astype(np.float32).tolist(), tensor, point, kernel.types.floats(p.ravel())]
-    for each in forms:
+    for form in forms:
         kernel.set_control_points(cube().positions)
-        kernel.set_control_points(each)
+        kernel.set_control_points(form)
         assert_same(kernel.evaluate(1, [0.3, 0.4], 2), expected, BARS[SINGLE])
     with pytest.raises(ValueError, match="21 coordinates; expected 24, x, y, z of 8 control points"):
         kernel.set_control_points(dr.zeros(kernel.types.float, 21))

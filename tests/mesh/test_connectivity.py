@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage
 from mitsuba_subdivision.cage import CageError
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
+from mitsuba_subdivision.cage.named_cages import cube, torus
 from mitsuba_subdivision.mesh.connectivity import paired
 from mitsuba_subdivision.refinement.refined_corners import differences
 from reference.exact_samples import mesh_of
@@ -79,12 +79,6 @@ def test_refinement_differs_where_one_mesh_is_sharp():
         assert not np.any(others)
         np.testing.assert_array_equal(is_wrong, sharp.cut_mesh.topology.semi_sharpness.edges > 0)
     assert not np.any(differences(*[meshes[0]] * 2, np.array(False)))
-
-
-def test_euler_characteristic():
-    cages = (cube(), 2), (torus(5, 4), 0), (extraordinary(6), 2), (extraordinary(6, closed=False), 1)
-    for cage, expected in cages:
-        assert cage.vertex_count - cage.topology.edge_count + cage.face_count == expected
 
 
 def test_fans_are_all_turns_about_each_inner_vertex_from_the_lowest_half_edge(any_cage):

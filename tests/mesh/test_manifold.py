@@ -67,16 +67,6 @@ def test_fans_that_share_a_vertex_are_apart(spokes):
         assert len(copies_of_fan) == max(1, sum(spoke in first for spoke in spokes))
 
 
-def test_all_sides_of_an_edge_have_the_same_points():
-    for peer in (book(3), book(4), joined(fidelity_cages.cube(), fidelity_cages.cube(), {0: 7, 1: 6})):
-        surface = msub.LimitSurface(cage_of(peer))
-        table = surface.sampling(4)
-        points = table.apply(surface.cage.positions)[0]
-        assert np.array_equal(points[table.copies[0]], points[table.copies[1]])
-        # Whoever gives a position has its own.
-        assert not np.isin(table.copies[1], table.copies[0]).any()
-
-
 @pytest.mark.parametrize("rate", [1, 2, 5])
 def test_tessellations_have_no_cracks_along_edges_of_many_faces(rate):
     pages = 3

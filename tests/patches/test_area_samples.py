@@ -109,10 +109,10 @@ def test_samples_do_not_depend_on_the_unit_of_length():
 
 def test_points_are_those_of_their_parameters():
     surface = surface_named("rook")
-    found = surface.sample(1000)
-    expected = surface.evaluate(found.element, found.uv, found.corner)
+    samples = surface.sample(1000)
+    expected = surface.evaluate(samples.element, samples.uv, samples.corner)
     for column in ("p", "n", "dp_du", "dp_dv"):
-        np.testing.assert_array_equal(getattr(found, column), getattr(expected, column))
+        np.testing.assert_array_equal(getattr(samples, column), getattr(expected, column))
 
 
 def test_holes_have_no_points():

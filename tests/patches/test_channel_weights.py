@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from kernels.surfaces import grid_locations
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.contents import Attribute
 from mitsuba_subdivision.patches import Channel, channel
 from patches.closed_cages import mixed_torus
-from patches.locations import grid_locations
 from reference.refined_cages import refine_first, tagged
 
 # Sums of some tens of terms of order one, in double precision.

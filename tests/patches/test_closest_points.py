@@ -5,14 +5,13 @@ Another path to them is a search by evaluation alone: many samples, and finer an
 
 import numpy as np
 import pytest
-from kernels.surfaces import KINDS, surface_named
+from kernels.surfaces import KINDS, grid_locations, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.patches import closest_points
 from mitsuba_subdivision.patches.closest_points import BoxTree
 from mitsuba_subdivision.patches.nearest_in_piece import TurnedBoxes, nearest_in_pieces
 from patches.closed_cages import bumpy, cage_of, creased
-from patches.locations import grid_locations
 from reference.refined_cages import refine_first, sheet, tagged
 from scipy.spatial import cKDTree
 
@@ -50,8 +49,8 @@ def distances_by_evaluation(surface, points, samples, start, uv, spacing):
         locations = np.clip(uv[:, None] + spacing * STEPS, 0, 1)
         if surface.scheme.domain.corner_count == 3:
             locations = np.clip(locations - np.maximum(locations.sum(axis=2, keepdims=True) - 1, 0) / 2, 0, 1)
-        found = surface._sampler.evaluate(np.repeat(start, len(STEPS)), locations.reshape(-1, 2))
-        away = np.linalg.norm(found.p.reshape(*locations.shape[:2], 3) - points[:, None], axis=2)
+        samples_near = surface._sampler.evaluate(np.repeat(start, len(STEPS)), locations.reshape(-1, 2))
+        away = np.linalg.norm(samples_near.p.reshape(*locations.shape[:2], 3) - points[:, None], axis=2)
         best = away.argmin(axis=1)
         uv = locations[np.arange(len(points)), best]
         distance, spacing = np.minimum(distance, away.min(axis=1)), spacing / 2
@@ -66,26 +65,26 @@ def along_tangents(points, nearest):
 
 
 @pytest.mark.parametrize("name", [*KINDS, "rook", "hexagon", "loop valence 50"])
-def test_found_points_are_the_nearest_and_ways_to_them_along_the_normal(name, np_rng):
+def test_no_point_is_nearer_and_ways_to_them_along_the_normal(name, np_rng):
     surface = surface_named(name)
     segments = max(3, round((SAMPLES / len(grid_locations(surface, 1)[0]) * 4) ** 0.5))
     start, uv = grid_locations(surface, segments)
     samples = surface._sampler.evaluate(start, uv)
     size, points = points_around(samples, np_rng)
-    found = surface.closest_point(points)
+    nearest = surface.closest_point(points)
     others = distances_by_evaluation(surface, points, samples, start, uv, 1 / segments)
     # Rounding counts in sizes of the coordinates.
     rounded = ROUNDED * (size + np.abs(points).max(axis=1))
-    assert (found.distance <= others + rounded).all()
+    assert (nearest.distance <= others + rounded).all()
     # Most minima that the other search finds are the same.
-    assert np.median(others - found.distance) <= 1e-5 * size
-    there = surface.evaluate(found.element, found.uv, found.corner)
-    np.testing.assert_array_equal(found.p, there.p)
-    np.testing.assert_array_equal(found.n, there.n)
-    np.testing.assert_array_equal(found.distance, np.linalg.norm(points - found.p, axis=1))
-    inside = surface.scheme.domain.inside(found.uv) > 1e-9
+    assert np.median(others - nearest.distance) <= 1e-5 * size
+    there = surface.evaluate(nearest.element, nearest.uv, nearest.corner)
+    np.testing.assert_array_equal(nearest.p, there.p)
+    np.testing.assert_array_equal(nearest.n, there.n)
+    np.testing.assert_array_equal(nearest.distance, np.linalg.norm(points - nearest.p, axis=1))
+    inside = surface.scheme.domain.inside(nearest.uv) > 1e-9
     assert inside.sum() > len(points) / 4
-    assert (along_tangents(points, there) <= ALONG_NORMAL * found.distance + rounded)[inside].all()
+    assert (along_tangents(points, there) <= ALONG_NORMAL * nearest.distance + rounded)[inside].all()
 
 
 @pytest.mark.core
@@ -97,19 +96,19 @@ def test_ways_cross_edges_of_elements_along_the_normal(scheme, np_rng):
     element, along = np_rng.integers(0, surface.patches.elements.face_count, count), np_rng.random(count)
     edge = surface.evaluate(element, np.stack([along, 0 * along], axis=1))
     points = edge.p + 0.01 * edge.n
-    found = surface.closest_point(points)
-    there = surface.evaluate(found.element, found.uv, found.corner)
-    np.testing.assert_allclose(found.p, edge.p, rtol=0, atol=1e-9)
-    assert (along_tangents(points, there) <= ALONG_NORMAL * found.distance).all()
+    nearest = surface.closest_point(points)
+    there = surface.evaluate(nearest.element, nearest.uv, nearest.corner)
+    np.testing.assert_allclose(nearest.p, edge.p, rtol=0, atol=1e-9)
+    assert (along_tangents(points, there) <= ALONG_NORMAL * nearest.distance).all()
 
 
 @pytest.mark.core
 def test_nearest_points_of_a_flat_sheet_are_projections():
     surface = LimitSurface(sheet(4, 3))
     points = np.array([[1.3, 2.2, 5.0], [2, 1, -1], [-1, 1.25, 1], [5, 4, 2], [0.5, -3, 0]])
-    found = surface.closest_point(points)
-    np.testing.assert_allclose(found.p, np.clip(points, 0, [4, 3, 0]), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(found.n, [[0, 0, 1]] * 5, rtol=0, atol=1e-14)
+    nearest = surface.closest_point(points)
+    np.testing.assert_allclose(nearest.p, np.clip(points, 0, [4, 3, 0]), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(nearest.n, [[0, 0, 1]] * 5, rtol=0, atol=1e-14)
 
 
 @pytest.mark.core
@@ -119,10 +118,10 @@ def test_extraordinary_points_are_found(valence):
     surface = LimitSurface(extraordinary(valence))
     pole = surface.evaluate(0, [[0.0, 0.0]])
     heights = np.array([0.0, 1e-12, 1e-6, 0.01, 1.0, 30.0])
-    found = surface.closest_point(pole.p + heights[:, None] * pole.n)
-    np.testing.assert_allclose(found.distance, heights, rtol=0, atol=ROUNDED)
+    nearest = surface.closest_point(pole.p + heights[:, None] * pole.n)
+    np.testing.assert_allclose(nearest.distance, heights, rtol=0, atol=ROUNDED)
     # Where the point is far away, a place beside the pole is as far, but for rounding of the squared distance.
-    np.testing.assert_allclose(found.p[:5], np.repeat(pole.p, 5, axis=0), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(nearest.p[:5], np.repeat(pole.p, 5, axis=0), rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ["valence 3", "valence 50", "dart", "loop valence 3", "doo_sabin mixed torus"])
@@ -141,8 +140,8 @@ def test_creases_are_found(np_rng):
     points = np_rng.uniform(1, 3, (50, 3)) * np_rng.choice([-1, 1], (50, 3))
     points[:20, 0] = np_rng.uniform(-1, 1, 20)
     points[:10, 1] = np_rng.uniform(-1, 1, 10)
-    found = LimitSurface(creased(cube())).closest_point(points)
-    np.testing.assert_allclose(found.p, np.clip(points, -1, 1), rtol=0, atol=1e-13)
+    nearest = LimitSurface(creased(cube())).closest_point(points)
+    np.testing.assert_allclose(nearest.p, np.clip(points, -1, 1), rtol=0, atol=1e-13)
 
 
 def test_the_cage_refined_once_has_the_same_nearest_points(np_rng, monkeypatch):
@@ -152,9 +151,9 @@ def test_the_cage_refined_once_has_the_same_nearest_points(np_rng, monkeypatch):
     refine_first(monkeypatch)
     refined = LimitSurface(surface.cage)
     assert refined.patches.refined is not None
-    found = refined.closest_point(points)
-    np.testing.assert_allclose(found.distance, expected.distance, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(found.p, expected.p, rtol=0, atol=1e-7)
+    nearest = refined.closest_point(points)
+    np.testing.assert_allclose(nearest.distance, expected.distance, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(nearest.p, expected.p, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ["mixed torus", "semi-sharp ring", "loop mixed torus"])
@@ -231,9 +230,9 @@ def test_no_points_have_no_nearest_ones():
 
 
 def test_a_collapsed_surface_is_a_point():
-    found = LimitSurface(cube().with_positions(np.ones((8, 3)))).closest_point([[1.0, 1.0, 4.0]])
-    np.testing.assert_allclose(found.p, [[1, 1, 1]], rtol=0, atol=1e-14)
-    np.testing.assert_array_equal(found.n, [[0, 0, 0]])
+    nearest = LimitSurface(cube().with_positions(np.ones((8, 3)))).closest_point([[1.0, 1.0, 4.0]])
+    np.testing.assert_allclose(nearest.p, [[1, 1, 1]], rtol=0, atol=1e-14)
+    np.testing.assert_array_equal(nearest.n, [[0, 0, 0]])
 
 
 @pytest.mark.parametrize("name", ["rook", "semi-sharp ring", "loop mixed torus"])

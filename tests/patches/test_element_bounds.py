@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from kernels.surfaces import KINDS, SURFACES, surface_named
+from kernels.surfaces import KINDS, SURFACES, grid_locations, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from patches.closed_cages import bumpy, cage_of
-from patches.locations import grid_locations
 from reference.refined_cages import refine_first, sheet, tagged
 
 SAMPLES = 5000
@@ -29,9 +28,9 @@ def assert_contained(surface, np_rng, count=SAMPLES):
     # Extremes often lie on edges.
     uv[: count // 4, 0] = 0
     for dtype in (np.float64, np.float32):
-        found = surface.evaluate(element, uv, corner, dtype=dtype).p.astype(np.float64)
-        assert (found >= lower[element]).all()
-        assert (found <= upper[element]).all()
+        points = surface.evaluate(element, uv, corner, dtype=dtype).p.astype(np.float64)
+        assert (points >= lower[element]).all()
+        assert (points <= upper[element]).all()
 
 
 @pytest.mark.parametrize("name", SURFACES)
@@ -93,10 +92,10 @@ def test_boxes_are_the_same_from_the_cage_refined_once(np_rng, monkeypatch):
     assert refined.patches.refined is not None
     assert_contained(refined, np_rng)
     monkeypatch.undo()
-    found, expected = ([each.lower, each.upper] for each in (refined.bounds(), LimitSurface(cage).bounds()))
+    boxes, expected = ([each.lower, each.upper] for each in (refined.bounds(), LimitSurface(cage).bounds()))
     size = np.linalg.norm(expected[1] - expected[0], axis=1).max()
     # Parts around extraordinary points are bounded otherwise.
-    np.testing.assert_allclose(found, expected, rtol=0, atol=0.03 * size)
+    np.testing.assert_allclose(boxes, expected, rtol=0, atol=0.03 * size)
 
 
 def test_elements_are_chosen_by_number():

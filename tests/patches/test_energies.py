@@ -79,9 +79,9 @@ def test_bending_is_the_integral_of_both_curvatures_squared():
     surface = LimitSurface(bumpy(named_cages.torus(7, 6)))
     uv, weights = surface.scheme.domain.quadrature(ORDER)
     count = surface.cage.face_count
-    found = surface.evaluate(np.repeat(np.arange(count), len(uv)), np.tile(uv, (count, 1)), derivatives=2)
-    area = np.linalg.norm(np.cross(found.dp_du, found.dp_dv), axis=1)
-    squares = 4 * found.mean_curvature**2 - 2 * found.gaussian_curvature
+    samples = surface.evaluate(np.repeat(np.arange(count), len(uv)), np.tile(uv, (count, 1)), derivatives=2)
+    area = np.linalg.norm(np.cross(samples.dp_du, samples.dp_dv), axis=1)
+    squares = 4 * samples.mean_curvature**2 - 2 * samples.gaussian_curvature
     expected = (np.tile(weights, count) * area * squares).sum()
     assert abs(bending_of_shape(surface, ORDER) / expected - 1) <= ROUNDING
 

@@ -84,8 +84,8 @@ def test_areas_turn_with_the_cage_and_grow_with_the_square_of_its_size(np_rng):
     small, large = (LimitSurface(cage.with_positions(unit * cage.positions)).area() for unit in (2.0**-30, 2.0**30))
     assert large == 2.0**120 * small
     for scale in (1e-90, 1e-30, 1e30, 1e80):
-        found = LimitSurface(cage.with_positions(scale * cage.positions)).area()
-        assert found / scale / scale == pytest.approx(LimitSurface(cage).area(), rel=1e-12)
+        area = LimitSurface(cage.with_positions(scale * cage.positions)).area()
+        assert area / scale / scale == pytest.approx(LimitSurface(cage).area(), rel=1e-12)
 
 
 def test_holes_have_no_area():

@@ -121,14 +121,14 @@ def test_far_faces_of_a_fan_do_not_matter(scheme, whole, corner, np_rng, monkeyp
     element = np.array([0, NEAR_FACES // 2, count - 3])
     for level in (1, FEW_LEVELS, 45):
         uv = np.tile([0.6, 0.31], (len(element), 1)) * 2.0**-level
-        found, expected = (LimitSurface(cage, each).evaluate(element, uv) for each in (scheme, whole))
-        np.testing.assert_allclose(found.p, expected.p, rtol=0, atol=ROUNDED_POINT)
-        np.testing.assert_allclose(found.n, expected.n, rtol=0, atol=ROUNDED_NORMAL)
+        near, expected = (LimitSurface(cage, each).evaluate(element, uv) for each in (scheme, whole))
+        np.testing.assert_allclose(near.p, expected.p, rtol=0, atol=ROUNDED_POINT)
+        np.testing.assert_allclose(near.n, expected.n, rtol=0, atol=ROUNDED_NORMAL)
         if level <= FEW_LEVELS:
             by_rules = LimitSurface(cage, whole).evaluate(element, uv, evaluator="power")
-            np.testing.assert_allclose(found.p, by_rules.p, rtol=0, atol=ROUNDED_POINT)
-            np.testing.assert_allclose(found.n, by_rules.n, rtol=0, atol=ROUNDED_NORMAL)
+            np.testing.assert_allclose(near.p, by_rules.p, rtol=0, atol=ROUNDED_POINT)
+            np.testing.assert_allclose(near.n, by_rules.n, rtol=0, atol=ROUNDED_NORMAL)
     # The limit at the vertex depends on no other faces than those on the border.
-    found, expected = (LimitSurface(cage, each).evaluate(element, [[0, 0]]) for each in (scheme, whole))
-    np.testing.assert_allclose(found.p, expected.p, rtol=0, atol=ROUNDED_POINT)
-    assert (found.n[:, 2] > 0).all()
+    near, expected = (LimitSurface(cage, each).evaluate(element, [[0, 0]]) for each in (scheme, whole))
+    np.testing.assert_allclose(near.p, expected.p, rtol=0, atol=ROUNDED_POINT)
+    assert (near.n[:, 2] > 0).all()

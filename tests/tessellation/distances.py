@@ -4,16 +4,16 @@ import numpy as np
 
 # Places on triangles: the centroid, middles of sides, and a point near each corner.
 PLACES = np.array([(2, 2, 2), (3, 3, 0), (0, 3, 3), (3, 0, 3), (4, 1, 1), (1, 4, 1), (1, 1, 4)]) / 6
-# Exact distances are found of so many points at once.
+# Exact distances are computed of so many points at once.
 TOGETHER = 32
 
 
 def distances(surface, table, most_triangles=6000, most_points=120, seed=0):
-    """Largest distances found of triangles from the surface, and of the surface from the triangles.
+    """Largest distances measured of triangles from the surface, and of the surface from the triangles.
 
     Each is measured at seven places on some triangles, and of the surface at the same parameters. The distance from the
-    counterpart bounds the distance from all of it, so that exact distances are found of the furthest points only.
-    Where more than ``most_points`` may be further than the largest found, that many more are chosen by chance.
+    counterpart bounds the distance from all of it, so that exact distances are computed of the furthest points only.
+    Where more than ``most_points`` may be further than the largest so far, that many more are chosen by chance.
     """
     positions, _ = table.apply(surface.cage.positions)
     corners, random = positions[table.triangles], np.random.default_rng(seed)
@@ -34,23 +34,23 @@ def distances(surface, table, most_triangles=6000, most_points=120, seed=0):
 
 
 def _largest(bounds, exact, most, random):
-    """Largest of some values, from upper bounds and a function that finds some of them."""
-    order, found, seen = np.argsort(-bounds), 0.0, 0
-    while seen < min(most, len(order)) and bounds[order[seen]] > found:
-        found = max(found, exact(order[seen : seen + TOGETHER]).max())
+    """Largest of some values, from upper bounds and a function that computes some of them."""
+    order, largest, seen = np.argsort(-bounds), 0.0, 0
+    while seen < min(most, len(order)) and bounds[order[seen]] > largest:
+        largest = max(largest, exact(order[seen : seen + TOGETHER]).max())
         seen += TOGETHER
-    rest = random.permutation(order[seen:][bounds[order[seen:]] > found])[:most]
-    return max(found, exact(rest).max(initial=0)) if len(rest) else found
+    rest = random.permutation(order[seen:][bounds[order[seen:]] > largest])[:most]
+    return max(largest, exact(rest).max(initial=0)) if len(rest) else largest
 
 
 def _from_all(points, corners, bounds):
     """``(s,)`` distances of points from the nearest of triangles ``(t, 3, 3)``, which are at most some bounds."""
-    lower, upper, found = corners.min(axis=1), corners.max(axis=1), bounds.copy()
+    lower, upper, nearest = corners.min(axis=1), corners.max(axis=1), bounds.copy()
     for index, point in enumerate(points):
         from_box = np.linalg.norm(np.maximum(0, np.maximum(lower - point, point - upper)), axis=1)
-        near = corners[from_box <= found[index]]
-        found[index] = distances_of_pairs(np.broadcast_to(point, (len(near), 3)), near).min(initial=found[index])
-    return found
+        near = corners[from_box <= nearest[index]]
+        nearest[index] = distances_of_pairs(np.broadcast_to(point, (len(near), 3)), near).min(initial=nearest[index])
+    return nearest
 
 
 def distances_of_pairs(points, corners):

@@ -60,19 +60,19 @@ EVERY_GRID = pytest.mark.parametrize(("scheme", "cage", "rate"), GRIDS.values(),
 def test_every_vertex_has_the_values_of_its_element_at_its_place(scheme, cage, rate, mode, np_rng):
     """And positions and normals do not change by a bit."""
     surface = LimitSurface(with_seams(bumpy(cage), np_rng, mode), scheme)
-    found, plain = (each.tessellate(rate) for each in (surface, LimitSurface(without_attributes(surface.cage), scheme)))
-    assert len(found.normals) == len(found.texcoords) == len(found.positions) > len(plain.positions)
-    np.testing.assert_array_equal(found.positions[found.triangles], plain.positions[plain.triangles])
-    np.testing.assert_array_equal(found.normals[found.triangles], plain.normals[plain.triangles])
-    np.testing.assert_array_equal(found.element, plain.element)
+    mesh, plain = (each.tessellate(rate) for each in (surface, LimitSurface(without_attributes(surface.cage), scheme)))
+    assert len(mesh.normals) == len(mesh.texcoords) == len(mesh.positions) > len(plain.positions)
+    np.testing.assert_array_equal(mesh.positions[mesh.triangles], plain.positions[plain.triangles])
+    np.testing.assert_array_equal(mesh.normals[mesh.triangles], plain.normals[plain.triangles])
+    np.testing.assert_array_equal(mesh.element, plain.element)
     # The fewest corners and the most among them.
     for element in np.argsort(surface.cage.face_sizes, kind="stable")[[0, 1, 2, 5, -3, -2, -1]]:
-        vertices = np.unique(found.triangles[found.element == element])
+        vertices = np.unique(mesh.triangles[mesh.element == element])
         corner, uv = lattice(surface, element, rate)
-        # Places are found again by the positions that they have.
-        distance, at = cKDTree(surface.evaluate(element, uv, corner).p).query(found.positions[vertices])
+        # Places are known again by the positions that they have.
+        distance, at = cKDTree(surface.evaluate(element, uv, corner).p).query(mesh.positions[vertices])
         assert distance.max() <= ROUNDING
-        for name, values in (("texcoords", found.texcoords), *found.attributes.items()):
+        for name, values in (("texcoords", mesh.texcoords), *mesh.attributes.items()):
             expected = surface.evaluate_attribute(name, element, uv[at], corner[at])
             np.testing.assert_allclose(values[vertices], expected, rtol=0, atol=ROUNDING)
 
@@ -92,11 +92,11 @@ def lattice(surface, element, rate):
 def test_vertices_are_split_where_seams_or_creases_are_only(scheme, cage, np_rng):
     cage = with_seams(bumpy(cage), np_rng)
     surface = LimitSurface(cage, scheme)
-    found = surface.tessellate(3)
+    mesh = surface.tessellate(3)
     t = cage.topology
     seam = surface.channel("texcoords").layout.seam | surface.channel("other_seams").layout.seam
     cut = ((seam | cage.tags.is_infinite) & (t.twin >= 0)).sum() + (t.twin < 0).sum()
-    edges = np.concatenate([found.triangles[:, [i, i - 1]] for i in range(3)])
+    edges = np.concatenate([mesh.triangles[:, [i, i - 1]] for i in range(3)])
     counts = np.unique(np.sort(edges, axis=1), axis=0, return_counts=True)[1]
     assert set(counts) <= {1, 2}
     assert (counts == 1).sum() == 3 * cut
@@ -108,13 +108,13 @@ def test_without_seams_the_vertices_are_those_of_the_surface(scheme, np_rng):
     colour = np_rng.random((cage.vertex_count, 3))
     surface = LimitSurface(tagged(cage, attributes={"colour": Attribute(colour)}), scheme)
     table = surface.sampling(3)
-    found = surface.attribute_table(table)
-    layout = found.layout
+    attributes = surface.attribute_table(table)
+    layout = attributes.layout
     assert layout.surface_vertex is None
     assert layout.triangles is table.triangles
     assert layout.gathered(colour) is colour
     # The same weights as for points, so that these come out as points do.
-    np.testing.assert_allclose(found.values["colour"], table.apply(colour)[0], rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(attributes.values["colour"], table.apply(colour)[0], rtol=0, atol=ROUNDING)
 
 
 def test_other_evaluators_keep_the_values(np_rng):
@@ -128,8 +128,8 @@ def test_smooth_attributes_are_the_same_on_both_sides_of_a_crease(np_rng):
     base = extraordinary(5)
     creases = [(0, far, 10) for far in base.face_vertices.reshape(-1, 4)[:3, 1].tolist()]
     attribute = Attribute(np_rng.standard_normal((base.vertex_count, 3)))
-    found = LimitSurface(tagged(base, creases=creases, attributes={"weight": attribute})).tessellate(5)
-    places = np.unique(found.positions, axis=0)
-    assert len(places) < len(found.positions)
+    mesh = LimitSurface(tagged(base, creases=creases, attributes={"weight": attribute})).tessellate(5)
+    places = np.unique(mesh.positions, axis=0)
+    assert len(places) < len(mesh.positions)
     # Bit by bit.
-    assert len(np.unique(np.hstack([found.positions, found.attributes["weight"]]), axis=0)) == len(places)
+    assert len(np.unique(np.hstack([mesh.positions, mesh.attributes["weight"]]), axis=0)) == len(places)

@@ -101,13 +101,13 @@ def test_a_warning_names_the_highest_rate_that_the_limit_needs(name, measure):
 def test_least_product_is_the_least(np_rng):
     """Of all integers up to 60, tried one by one."""
     forms = 10 ** np_rng.uniform(-2, 1.5, (3, 3, 400))
-    found = least_product(forms)
+    products = least_product(forms)
     n, m = (each.ravel() for each in np.indices((60, 60)) + 1)
     a, b, c = forms[:, :, :, None].swapaxes(0, 1)
     holds = ((a / n**2 + 2 * b / (n * m) + c / m**2) <= 1).all(axis=0)
-    assert holds[np.arange(len(found)), (found[:, 0] - 1) * 60 + found[:, 1] - 1].all()
+    assert holds[np.arange(len(products)), (products[:, 0] - 1) * 60 + products[:, 1] - 1].all()
     # Those next to the best real numbers are tried: a product that is a little less may be further away.
-    own, least = found.prod(axis=1), np.where(holds, n * m, np.inf).min(axis=1)
+    own, least = products.prod(axis=1), np.where(holds, n * m, np.inf).min(axis=1)
     assert np.mean(own / least) < 1.01
     assert (own <= 1.25 * least + 1).all()
 
@@ -189,26 +189,15 @@ def derivatives_of(patches):
     return list(np.einsum("dab,bxt->daxt", BICUBIC.two_derivatives, patches))
 
 
-@pytest.mark.parametrize("measure", Measure)
-def test_u_and_v_are_alike(measure, np_rng):
-    """Exchanged, they exchange the segments that are needed along them."""
-    u, v = (BICUBIC.indices / 3).T
-    # Longer along one than along the other.
-    patches = np.stack([0.2 * u, 3 * v, 0 * u], axis=1)[..., None] + 0.01 * np_rng.normal(size=(len(u), 3, 50))
-    derivatives, criterion = derivatives_of(patches), Criterion(measure, 1e-3)
-    exchanged = criterion.form(patches, [derivatives[i] for i in (1, 0, 4, 3, 2)], 4)
-    np.testing.assert_allclose(exchanged, criterion.form(patches, derivatives, 4)[::-1], rtol=ROUNDING)
-
-
 @pytest.mark.parametrize("scale", [1e-3, 1e-19, 1e-21, 1e-30, 1e-40, 0])
 def test_a_tangent_that_nearly_vanishes_leaves_the_whole_difference_as_the_bound(scale):
     """At a curve in place of a surface, however much of the other tangent rounding leaves; in single precision."""
     u, _ = (BICUBIC.indices / 3).T
     points = np.stack([u, 0 * u, u**3], axis=1)[..., None].astype(np.float32)
-    found = [each.astype(np.float32) for each in derivatives_of(points)]
-    found[1][:] = np.float32(scale) * np.array([0, 0, 1])[:, None]
-    form = Criterion(Measure.CHORD, 1.0).form(points, found, 4)
-    whole = np.sqrt(np.square(found[2]).sum(axis=1).max(axis=0))
+    derivatives = [each.astype(np.float32) for each in derivatives_of(points)]
+    derivatives[1][:] = np.float32(scale) * np.array([0, 0, 1])[:, None]
+    form = Criterion(Measure.CHORD, 1.0).form(points, derivatives, 4)
+    whole = np.sqrt(np.square(derivatives[2]).sum(axis=1).max(axis=0))
     assert (form[0] <= np.float32(1 + 1e-6) * whole / 8).all()
     assert (form[0] > 0).all()
 
@@ -223,7 +212,7 @@ def test_an_outline_in_view_is_noticed(direction, np_rng):
     axis /= np.linalg.norm(axis, axis=0)
     eye = np.array([0.0, -4, 1])
     cone = Cone(axis, np.sin(angle))
-    found = Sensor(eye, 1e-3, direction).may_see_outline(centre - half, centre + half, cone)
+    may_see = Sensor(eye, 1e-3, direction).may_see_outline(centre - half, centre + half, cone)
 
     places = np_rng.uniform(-1, 1, (samples, 3, count))
     places[::2] = np.sign(places[::2])
@@ -232,11 +221,11 @@ def test_an_outline_in_view_is_noticed(direction, np_rng):
     normals = np.cos(angle) * axis + np.sin(angle) * across / np.linalg.norm(across, axis=1, keepdims=True)
     view = points - eye[:, None] if direction is None else np.broadcast_to(direction[:, None], points.shape)
     tilt = np.einsum("sit,uit->sut", normals, view).reshape(-1, count)
-    assert found[(tilt.min(axis=0) < 0) & (tilt.max(axis=0) > 0)].all()
+    assert may_see[(tilt.min(axis=0) < 0) & (tilt.max(axis=0) > 0)].all()
     view_length = 1 if direction is not None else np.linalg.norm(view, axis=1).max(axis=0)
     margin = np.sin(BESIDE_OUTLINE) * view_length
     is_near = (tilt.min(axis=0) < margin) & (tilt.max(axis=0) > -margin)
-    assert np.count_nonzero(found) < 1.2 * np.count_nonzero(is_near)
+    assert np.count_nonzero(may_see) < 1.2 * np.count_nonzero(is_near)
 
 
 def test_pixels_are_as_small_as_at_the_nearest_point_of_a_box(np_rng):

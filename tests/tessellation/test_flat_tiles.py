@@ -60,13 +60,13 @@ def extents(tile, values, axes):
     return _extent(tile.hull, values, np.repeat(axes[:, :, None], values.shape[2], axis=2))
 
 
-def assert_tight(found, axes, samples, loose=LOOSE):
+def assert_tight(extent, axes, samples, loose=LOOSE):
     """Whether extents along axes, of tiles of several groups, are those of their samples."""
-    found = np.concatenate(found)
+    extent = np.concatenate(extent)
     size, whole = (np.concatenate([sizes(each, along) for each in samples]) for along in (axes, np.eye(3)))
-    assert (found >= (1 - MISSED) * size - ROUNDING).all()
-    is_tight = found - size <= loose * np.linalg.norm(axes) * whole
-    assert np.mean(is_tight[np.isfinite(found)]) > MOST
+    assert (extent >= (1 - MISSED) * size - ROUNDING).all()
+    is_tight = extent - size <= loose * np.linalg.norm(axes) * whole
+    assert np.mean(is_tight[np.isfinite(extent)]) > MOST
 
 
 @pytest.mark.parametrize(
@@ -86,8 +86,8 @@ def test_surfaces_are_hardly_smaller_than_their_extents(name, axis_count, is_con
         scheme.has_convex_rules = False
     groups = list(tiles_of(surface, scheme))
     if groups or not is_convex:
-        found = [extents(*each, axes) for *each, _ in groups]
-        assert_tight(found, axes, [samples for *_, samples in groups], LOOSE if is_convex else LOOSE_OF_ANY_RULES)
+        computed = [extents(*each, axes) for *each, _ in groups]
+        assert_tight(computed, axes, [samples for *_, samples in groups], LOOSE if is_convex else LOOSE_OF_ANY_RULES)
 
 
 @pytest.mark.parametrize("unit", [1e-60, 1e60])
