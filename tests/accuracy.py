@@ -14,28 +14,20 @@ import time
 import warnings
 
 import numpy as np
+from evaluation.common import BARS, largest_errors
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.evaluation import element, irregular_patch, patch_tree
 from mitsuba_subdivision.mesh import one_ring
 from mitsuba_subdivision.mesh.signature import signature_at
 from reference import bars
-from reference.exact_samples import SCHEMES, ExactSamples, angle, curvature_error, samples_at
+from reference.exact_samples import SCHEMES, ExactSamples, angle, samples_at
 
 VALENCES = (*range(3, 13), 20, 50, 100)
 HIGH_VALENCES = (200, 500, 1000)
 HIGH_LEVELS = (0, 2, 6)
 
 # Column of the table, and the bar of the value there; None where there is none.
-COLUMNS = {
-    "point": bars.POINT,
-    "d/du, d/dv": bars.DERIVATIVE,
-    "second": bars.SECOND_DERIVATIVE,
-    "normal": bars.NORMAL,
-    "curvature": bars.CURVATURE,
-    "point f32": bars.POINT_FLOAT32,
-    "normal f32": bars.NORMAL_FLOAT32,
-    "build ms": None,
-}
+COLUMNS = {**BARS, "point f32": bars.POINT_FLOAT32, "normal f32": bars.NORMAL_FLOAT32, "build ms": None}
 
 
 def build_time(surface: LimitSurface) -> float:
@@ -57,28 +49,15 @@ def build_time(surface: LimitSurface) -> float:
 def errors(exact: ExactSamples, surface: LimitSurface) -> dict[str, float]:
     """The largest error of each column over all samples; the point itself among them."""
     at_point = [[0.0, 0.0]]
-    found = surface.evaluate(0, exact.uv, derivatives=2)
-    limit = surface.evaluate(0, at_point)
+    samples, limit = surface.evaluate(0, exact.uv, derivatives=2), surface.evaluate(0, at_point)
     single, single_limit = (surface.evaluate(0, uv, dtype=np.float32) for uv in (exact.uv, at_point))
-    first, second = (exact.derivative_scale(found.level, order)[:, None] * exact.size for order in (1, 2))
-    near = found.level <= bars.CURVATURE_LEVELS
-    curvature = np.stack([found.gaussian_curvature, found.mean_curvature])
-    result = {
-        name: max(np.abs(samples.p - exact.p).max(), np.abs(at_limit.p - exact.limit_p).max()) / exact.size
-        for name, samples, at_limit in (("point", found, limit), ("point f32", single, single_limit))
-    }
-    if exact.valence == 2:
-        # The normal turns to and fro with the levels, and has no limit.
-        return result
-    seconds = np.stack([found.d2p_duu, found.d2p_duv, found.d2p_dvv])
-    return {
-        **result,
-        "d/du, d/dv": np.abs([(found.dp_du - exact.dp_du) / first, (found.dp_dv - exact.dp_dv) / first]).max(),
-        "second": np.abs((seconds - exact.second) / second).max(),
-        "normal": max(angle(found.n, exact.n).max(), angle(limit.n[0], exact.limit_n)),
-        "curvature": curvature_error(curvature[:, near], exact.curvature[:, near]).max(),
-        "normal f32": max(angle(single.n, exact.n).max(), angle(single_limit.n[0], exact.limit_n)),
-    }
+    points, normals = {}, {}
+    for suffix, here, there in (("", samples, limit), (" f32", single, single_limit)):
+        at_samples, at_limit = np.abs(here.p - exact.p).max(), np.abs(there.p - exact.limit_p).max()
+        points[f"point{suffix}"] = max(at_samples, at_limit) / exact.size
+        normals[f"normal{suffix}"] = max(angle(here.n, exact.n).max(), angle(there.n[0], exact.limit_n))
+    # At valence 2 the normal turns to and fro with the levels, and has no limit.
+    return points if exact.valence == 2 else {**largest_errors(samples, exact), **points, **normals}
 
 
 def main() -> int:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from kernels.surfaces import KINDS, SURFACES, grid_locations, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary
+from mitsuba_subdivision.cage.named_cages import cube
 from patches.closed_cages import bumpy, cage_of
 from reference.refined_cages import refine_first, sheet, tagged
 
@@ -121,11 +121,3 @@ def test_elements_that_do_not_exist_are_an_error(element, problem):
 def test_a_collapsed_surface_has_boxes():
     bounds = LimitSurface(cube().with_positions(np.zeros((8, 3)))).bounds()
     np.testing.assert_array_equal([bounds.lower, bounds.upper], 0)
-
-
-def test_boxes_do_not_depend_on_the_numbering_of_faces():
-    cage = bumpy(extraordinary(5))
-    faces = cage.face_vertices.reshape(-1, 4)
-    turned = ControlCage(cage.positions, np.roll(faces[::-1], 1, axis=1))
-    bounds, others = LimitSurface(cage).bounds(), LimitSurface(turned).bounds()
-    np.testing.assert_allclose(bounds.lower, others.lower[::-1], rtol=0, atol=1e-12)
