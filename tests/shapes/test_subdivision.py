@@ -10,10 +10,10 @@ from peers.fidelity_cages import book, fan, joined, pole
 from peers.fidelity_cages import cube as box
 from reference.bars import NORMAL_FLOAT32, NORMAL_FLOAT32_VALENCES
 from reference.exact_samples import SCHEMES, angle, samples_at
-from shapes.cages import cube, described, load, with_attributes
+from shapes.cages import RING, cube, described, load, with_attributes
 from shapes.scenes import SINGLE, WIDTHS, buffer, down, hit, scene_with, vertices
 from shapes.updates import update
-from shapes.variants import every_variant, mirrors, scalar
+from shapes.variants import every_variant, llvm, mirrors, scalar, shadings
 
 SCENE = """<scene version="3.0.0">
 <shape type="subdivision"><string name="filename" value="{}"/></shape></scene>"""
@@ -253,7 +253,115 @@ def test_face_normals():
     assert dr.allclose(hit(shape).t, 5 - 2 * (5 - si.t), atol=0.1)
 
 
-# Parameters that `traverse` shows
+# Where the shape lies: `to_world`, and places far from the origin
+
+SHIFT = np.array([1e4, -3e3, 1e3]) + 1 / 3
+
+
+def mirrored(scale=(-1, 2, 3)):
+    return mi.ScalarTransform4f().translate([3, 1, 2]).rotate([1, 2, 0], 40).scale(list(scale))
+
+
+def placed(cage, to_world, **options):
+    """Exact points and normals in the world."""
+    tessellation, matrix = LimitSurface(cage).tessellate(4, **options), np.array(to_world.matrix, dtype=np.float64)
+    normals = tessellation.normals @ np.linalg.inv(matrix[:3, :3])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return tessellation.positions @ matrix[:3, :3].T + matrix[:3, 3], normals
+
+
+@pytest.mark.parametrize("how", ["to_world", "cage", "cage, and back", "cage, turned"])
+@every_variant
+def test_a_far_place_costs_normals_nothing_and_points_no_more_than_a_ply_loses(tmp_path, how):
+    cage = named_cages.extraordinary(5)
+    there, back = (mi.ScalarTransform4f().translate((sign * SHIFT).tolist()) for sign in (1, -1))
+    moved = cage.with_positions(cage.positions + SHIFT)
+    given, to_world = {
+        "to_world": (cage, there),
+        "cage": (moved, mi.ScalarTransform4f()),
+        "cage, and back": (moved, back),
+        "cage, turned": (moved, mirrored([1, 2, 3])),
+    }[how]
+    (p, n), (positions, normals) = vertices(make(given, to_world=to_world)), placed(given, to_world)
+    assert angle(n, normals).max() <= NORMAL_FLOAT32
+    tessellation = LimitSurface(cage).tessellate(4)
+    tessellation.save(tmp_path / "exact.ply")
+    ply = mi.load_dict({"type": "ply", "filename": str(tmp_path / "exact.ply"), "to_world": there})
+    lost = np.abs(buffer(ply, "vertex_positions").astype(np.float64) - tessellation.positions - SHIFT).max()
+    # The place of the surface as a whole may be rounded as well. Turned, it is larger.
+    lost *= np.linalg.norm(np.array(to_world.matrix)[:3, :3], 2)
+    assert np.abs(p.astype(np.float64) - positions).max() <= 2 * lost
+
+
+@every_variant
+def test_control_points_of_a_far_cage_keep_their_digits_where_they_stay():
+    cage = named_cages.extraordinary(5)
+    shape = make(cage.with_positions(cage.positions + SHIFT))
+    normals, parameters = buffer(shape, "vertex_normals"), mi.traverse(shape)
+    kind, given = type(parameters["control_points"]), np.array(parameters["control_points"])
+    given[0] += 0.5
+    update(parameters, control_points=upload(kind, given))
+    moved = cage.positions + SHIFT
+    moved[0, 0] = given[0]
+    expected = LimitSurface(cage.with_positions(moved)).tessellate(4)
+    assert angle(buffer(shape, "vertex_normals"), expected.normals).max() <= NORMAL_FLOAT32
+    assert np.abs(buffer(shape, "vertex_normals") - normals).max() > 0.1
+    given[0] = np.float32(cage.positions[0, 0] + SHIFT[0])
+    update(parameters, control_points=upload(kind, given))
+    np.testing.assert_array_equal(buffer(shape, "vertex_normals"), normals)
+
+
+@pytest.mark.core
+@shadings
+@pytest.mark.parametrize("mode", ["backward", "forward"])
+@llvm
+def test_derivatives_by_control_points_are_the_same_far_away(shading, mode):
+    """Coordinates that stay as they are loaded had none, so that no fit moved a far cage."""
+    derivatives, cage = [], named_cages.extraordinary(5)
+    for shift in (0, SHIFT):
+        parameters = mi.traverse(make(cage.with_positions(cage.positions + shift), shading=shading))
+        points = parameters["control_points"]
+        dr.enable_grad(points)
+        parameters.update()
+        weights = dr.linspace(mi.Float, -1, 1, len(parameters["vertex_positions"]))
+        if mode == "backward":
+            dr.backward(dr.sum(parameters["vertex_positions"] * weights))
+            derivatives.append(np.array(dr.grad(points)))
+        else:
+            dr.set_grad(points, dr.linspace(mi.Float, -1, 1, len(points)))
+            derivatives.append(np.array(dr.forward_to(parameters["vertex_positions"])))
+    assert np.abs(derivatives[0]).max() > 0.1
+    np.testing.assert_allclose(derivatives[1], derivatives[0], rtol=0, atol=10 * SINGLE * np.abs(derivatives[0]).max())
+
+
+@every_variant
+def test_other_evaluators_are_placed_as_well():
+    cage = cube(creases=RING)
+    p, n = vertices(make(cage, evaluator="stam", sample_offset=1e-3, to_world=mirrored()))
+    positions, normals = placed(cage, mirrored(), sample_offset=1e-3)
+    np.testing.assert_allclose(p, positions, atol=1e-3)
+    # Away from extraordinary points, where Stam's form is right.
+    assert np.median(np.linalg.norm(n - normals, axis=1)) <= 1e-5
+
+
+@every_variant
+def test_a_refused_update_leaves_faces_and_normals_in_step():
+    shape, to_world = make(cube()), mirrored()
+    parameters = mi.traverse(shape)
+    kind, points = type(parameters["control_points"]), np.array(parameters["control_points"])
+    with pytest.raises(ValueError, match="finite"):
+        update(parameters, control_points=upload(kind, points * np.nan), to_world=to_world)
+    update(parameters, control_points=upload(kind, points))
+    expected = make(cube(), to_world=to_world)
+    for name in ("vertex_positions", "vertex_normals", "faces"):
+        np.testing.assert_array_equal(buffer(shape, name), buffer(expected, name))
+
+
+@every_variant
+def test_to_world_is_of_the_type_that_mitsubas_shapes_have():
+    shown, expected = mi.traverse(make()), mi.traverse(mi.load_dict({"type": "rectangle"}))
+    assert type(shown["to_world"]) is type(expected["to_world"])
+    assert shown.flags("to_world") == expected.flags("to_world")
 
 
 # In a scene
