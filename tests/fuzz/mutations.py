@@ -2,7 +2,7 @@
 
 import re
 import struct
-from functools import partial
+from collections.abc import Callable
 from random import Random
 
 _TOKEN = re.compile(rb"[^\s()\[\]{},=]+")
@@ -31,41 +31,48 @@ _REACH = 100
 
 def mutated(content: bytes, words: tuple[bytes, ...], random: Random) -> bytes:
     """``content`` with one to four pieces of damage; ``words`` mean something in files of the kind."""
-    kinds = (*_KINDS, *[partial(_word, words)] * 2)
     for _ in range(random.choice((1, 1, 2, 4))):
         # Anywhere, so that the beginning, which most damage makes useless, is as likely as any other place.
         start = random.randint(0, len(content)) if random.random() < 0.7 else 0
         end = start + _REACH if start else len(content)
-        content = content[:start] + random.choice(kinds)(content[start:end], random) + content[end:]
+        content = content[:start] + _damaged(content[start:end], words, random) + content[end:]
     return content
 
 
-def _number(content: bytes, random: Random) -> bytes:
-    return _put(content, _any(_NUMBER, content, random), random.choice(_NUMBERS))
+def _damaged(content: bytes, words: tuple[bytes, ...], random: Random) -> bytes:
+    if random.random() < 0.3:
+        return random.choice((_swapped_words, _flipped_bits, _slice, _slice, _lines, _lines))(content, random)
+    pattern, replaced = random.choice((*_REPLACED, *[(_TOKEN, lambda *_: random.choice(words))] * 2))
+    start, end = _any(pattern, content, random)
+    new = replaced(content[start:end], random)
+    if pattern is None:
+        # In place of as many bytes, or between two.
+        end = start + random.choice((0, len(new)))
+    return content[:start] + new + content[end:]
 
 
-def _close_number(content: bytes, random: Random) -> bytes:
-    """Another small integer, which may still fit."""
-    return _put(content, _any(_NUMBER, content, random), str(random.randint(-3, 12)).encode())
+# What is replaced, anywhere for None, and by what.
+_REPLACED: tuple[tuple[re.Pattern[bytes] | None, Callable[[bytes, Random], bytes]], ...] = (
+    (_NUMBER, lambda _, random: random.choice(_NUMBERS)),
+    (_NUMBER, lambda _, random: random.choice(_NUMBERS)),
+    # Another small integer, which may still fit.
+    (_NUMBER, lambda _, random: str(random.randint(-3, 12)).encode()),
+    (_TOKEN, lambda word, _: word * (_LONG // max(len(word), 1))),
+    (_TOKEN, lambda word, random: word[: random.randint(0, len(word))] + random.choice(_BYTES)),
+    (None, lambda _, random: random.randbytes(random.choice((1, 2, 4, 8, 30)))),
+    (None, lambda _, random: random.choice((*_PACKED, *_BYTES))),
+)
 
 
-def _word(words: tuple[bytes, ...], content: bytes, random: Random) -> bytes:
-    return _put(content, _any(_TOKEN, content, random), random.choice(words))
-
-
-def _long_word(content: bytes, random: Random) -> bytes:
-    start, end = _any(_TOKEN, content, random)
-    return _put(content, (start, end), content[start:end] * (_LONG // max(end - start, 1)))
+def _any(pattern: re.Pattern[bytes] | None, content: bytes, random: Random) -> tuple[int, int]:
+    """A place of the pattern, any where there is none."""
+    spans = [match.span() for match in pattern.finditer(content)] if pattern else []
+    return random.choice(spans) if spans else (random.randint(0, len(content)),) * 2
 
 
 def _swapped_words(content: bytes, random: Random) -> bytes:
     (a, b), (c, d) = sorted((_any(_TOKEN, content, random), _any(_TOKEN, content, random)))
     return content[:a] + content[c:d] + content[b:c] + content[a:b] + content[d:] if b <= c else content
-
-
-def _word_part(content: bytes, random: Random) -> bytes:
-    start, end = _any(_TOKEN, content, random)
-    return _put(content, (random.randint(start, end), end), random.choice(_BYTES))
 
 
 def _flipped_bits(content: bytes, random: Random) -> bytes:
@@ -75,67 +82,20 @@ def _flipped_bits(content: bytes, random: Random) -> bytes:
     return bytes(damaged)
 
 
-def _random_bytes(content: bytes, random: Random) -> bytes:
-    start, count = random.randint(0, len(content)), random.choice((1, 2, 4, 8, 30))
-    return _put(content, (start, start + random.choice((0, count))), random.randbytes(count))
-
-
-def _packed_number(content: bytes, random: Random) -> bytes:
-    packed, start = random.choice(_PACKED), random.randint(0, len(content))
-    return _put(content, (start, start + len(packed)), packed)
-
-
-def _inserted(content: bytes, random: Random) -> bytes:
-    start = random.randint(0, len(content))
-    return _put(content, (start, start), random.choice(_BYTES))
-
-
 def _slice(content: bytes, random: Random) -> bytes:
-    """A part left out, doubled, or moved to another place."""
+    """A part left out, doubled, or moved to another place; or everything from there on left out."""
     start = random.randint(0, len(content))
     end = min(len(content), start + random.choice((1, 2, 10, 100)))
     rest = content[:start] + content[end:]
     place = random.randint(0, len(rest))
     moved = rest[:place] + content[start:end] + rest[place:]
-    return random.choice((rest, content[:end] + content[start:], moved))
-
-
-def _cut(content: bytes, random: Random) -> bytes:
-    return content[: random.randint(0, len(content))]
+    return random.choice((rest, content[:end] + content[start:], moved, content[:start]))
 
 
 def _lines(content: bytes, random: Random) -> bytes:
     """A line left out, cut, repeated, or in another place."""
     lines = content.splitlines(keepends=True) or [b""]
     place, line = random.randrange(len(lines)), random.choice(lines)
-    change = random.randrange(5)
-    if change == 0:
-        del lines[place]
-    elif change == 1:
-        lines[place] = lines[place][: random.randint(0, len(lines[place]))]
-    elif change == 2:
-        lines.insert(place, line)
-    elif change == 3:
-        lines[place:place] = [line] * random.choice((2, 50))
-    else:
-        lines[place] = line
-    return b"".join(lines)
-
-
-_KINDS = (
-    _number, _number, _number, _close_number, _close_number, _long_word, _swapped_words, _word_part,
-    _flipped_bits, _random_bytes, _packed_number, _inserted, _slice, _cut, _lines, _lines,
-)  # fmt: skip
-
-
-def _any(pattern: re.Pattern[bytes], content: bytes, random: Random) -> tuple[int, int]:
-    """A place of the pattern, any where there is none."""
-    spans = [match.span() for match in pattern.finditer(content)]
-    if not spans:
-        start = random.randint(0, len(content))
-        return start, start
-    return random.choice(spans)
-
-
-def _put(content: bytes, span: tuple[int, int], new: bytes) -> bytes:
-    return content[: span[0]] + new + content[span[1] :]
+    cut = lines[place][: random.randint(0, len(lines[place]))]
+    new = random.choice(([], [cut], [line], [line, lines[place]], [line] * 50 + [lines[place]]))
+    return b"".join([*lines[:place], *new, *lines[place + 1 :]])
