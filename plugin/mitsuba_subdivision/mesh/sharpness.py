@@ -1,15 +1,8 @@
 """Sharpness of edges and vertices. It is infinite from 10; below, it lasts for a number of refinements (semi-sharp).
 
-Two classes hold sharpness, the second computed from the first:
-
-`Sharpness` (`cuts`): sharpness of the control cage, from its tags.
-    One number for each edge and each vertex, including infinite sharpness.
-`SemiSharpness`: sharpness of a mesh that is cut along its infinitely sharp edges.
-    Infinite sharpness is represented by borders and corners of the mesh, so only finite sharpness remains. It is
-    computed for each refinement of the mesh (`SemiSharpness.refined`).
-
-A `Fan` of a signature has that around one vertex, in order from one of its faces, which `joined_rings` converts to a
-`SemiSharpness` of the local mesh.
+`Sharpness` (`cuts`) has that of the control cage, from its tags, including infinite sharpness. `SemiSharpness` has that
+of a mesh that is cut along its infinitely sharp edges, where only finite sharpness remains. A `Fan` of a signature has
+that around one vertex, from which `joined_rings` makes a `SemiSharpness` of the local mesh.
 """
 
 from __future__ import annotations

@@ -57,16 +57,13 @@ class StencilTable:
     @classmethod
     def of(cls, row_count: int, column_count: int, *entries: tuple[NDArray, NDArray, NDArray | float]) -> StencilTable:
         """Create a table from several (rows, columns, weights). Entries with the same row and column add up."""
-        # int32 halves the memory, as faces with n corners have n² entries, and saves a conversion in `matrix`.
-        is_short = max(row_count, column_count) <= np.iinfo(np.int32).max
-        index_type = np.int32 if is_short else np.int64
-        rows: IntArray = np.concatenate([rows for rows, _, _ in entries], dtype=index_type, casting="same_kind")
-        columns: IntArray = np.concatenate(
-            [columns for _, columns, _ in entries], dtype=index_type, casting="same_kind"
+        # int32 halves the memory, as faces with n corners have n² entries, and saves a conversion in `matrix`. Vertices
+        # of a cage that is refined once fit into it.
+        every_row, every_column, every_weight = zip(*entries, strict=True)
+        rows, columns = (
+            np.concatenate(indices, dtype=np.int32, casting="same_kind") for indices in (every_row, every_column)
         )
-        weights = np.concatenate(
-            [weights if np.ndim(weights) else np.full(len(rows), weights) for rows, _, weights in entries]
-        )
+        weights = np.concatenate([np.broadcast_to(w, len(r)) for r, w in zip(every_row, every_weight, strict=True)])
         return cls(row_count, column_count, rows, columns, weights)
 
     @classmethod
@@ -81,12 +78,8 @@ class StencilTable:
         """``(row_count, column_count)`` sparse array with a stencil in each row."""
         from scipy import sparse
 
-        shape = self.row_count, self.column_count
-        is_short = max(*shape, len(self.rows)) <= np.iinfo(np.int32).max
-        rows, columns = (
-            indices.astype(np.int32, copy=False) if is_short else indices for indices in (self.rows, self.columns)
-        )
-        return sparse.coo_array((self.weights, (rows, columns)), shape=shape).tocsr()
+        rows, columns = (indices.astype(np.int32, copy=False) for indices in (self.rows, self.columns))
+        return sparse.coo_array((self.weights, (rows, columns)), (self.row_count, self.column_count)).tocsr()
 
     def entries(self, rows: IntArray) -> tuple[IntArray, IntArray, FloatArray]:
         """Return index in ``rows``, column and weight of the entries of refined vertices, in the order of ``rows``."""
