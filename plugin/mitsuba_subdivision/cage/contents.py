@@ -63,11 +63,7 @@ def validated_attribute(
     order: IntArray | None = None,
     width: int | None = None,  # Required number of columns
 ) -> Attribute:
-    """Check an attribute of a cage, and return it with read-only arrays of float64 and int64.
-
-    Raises CageError if sizes do not match, an index is out of range, a value is not finite, or the interpolation is
-    unknown.
-    """
+    """Check an attribute of a cage, and return it with read-only arrays of float64 and int64."""
     attribute = given if isinstance(given, Attribute) else Attribute(given)
     interpolation, indices = attribute.interpolation, attribute.indices
     label = f'{source.name}: attribute "{shortened(name)}"'

@@ -36,10 +36,7 @@ SHOWN = 3
 
 
 def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.float64]:
-    """Check positions and return a read-only ``(n, 3)`` float64 copy.
-
-    Raises CageError if the shape is not ``(n, 3)`` with ``n > 0``, or a coordinate is not finite.
-    """
+    """Check that positions are an ``(n, 3)`` table of finite numbers, and return a read-only float64 copy."""
     expected = "expected an (n, 3) array of numbers"
     try:
         array = np.asarray(positions)
@@ -58,10 +55,7 @@ def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.
 
 
 def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSource) -> tuple[NDArray, NDArray]:
-    """Return sizes and concatenated vertices of faces, not yet validated.
-
-    Raises CageError if ``faces`` are neither sequences nor an (f, k) array.
-    """
+    """Return sizes and concatenated vertices of faces, not yet validated."""
     if hasattr(faces, "__array__"):
         table = np.asarray(faces)
         if table.ndim != 2:
@@ -88,14 +82,9 @@ def validated_faces(
 ) -> tuple[Topology, NonManifold | None, IntArray | None]:
     """Check the faces of a cage, turn over those against their neighbours, and cut the mesh at non-manifold edges.
 
-    Raises CageError if there are no faces, sizes do not add up, a face has fewer than three vertices, or an index is
-    not an integer or out of range; with ``strict``, also if a face has a vertex twice, an edge has more than two faces,
-    neighbouring faces have opposite windings, or the faces of a vertex are not one fan. Warns if vertices belong to no
-    face, faces are turned over, or the faces are not a manifold.
-
-    Returns the topology, in which half-edges of non-manifold edges have no twin, and vertices may have several fans;
-    non-manifold edges and vertices, None for a manifold; and, if faces were turned over, (n_h,) int64, the given face
-    corner of each face corner of the topology.
+    Raises CageError and warns as `ControlCage` says. Returns the topology, in which half-edges of non-manifold edges
+    have no twin, and vertices may have several fans; non-manifold edges and vertices, None for a manifold; and, if
+    faces were turned over, (n_h,) int64, the given face corner of each face corner of the topology.
     """
     flat_sizes, flat_vertices = _flat(face_sizes, "face_sizes", source), _flat(face_vertices, "face_vertices", source)
     sizes = _integers(flat_sizes, "face_sizes", source)
@@ -195,10 +184,7 @@ def _description(t: Topology, non_manifold: NonManifold, source: CageSource) -> 
 
 
 def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) -> IntArray:
-    """Check the faces that are holes, and return them sorted, without repetitions.
-
-    Raises CageError if an index is not an integer or out of range, or all faces are holes.
-    """
+    """Check the faces that are holes, not all of them, and return them sorted, without repetitions."""
     faces = validated_face_indices(topology, holes, "hole", source)
     if len(faces) == topology.face_count:
         raise CageError(f"{source.name}: all {len(faces)} faces are holes; expected at least one that is not")
@@ -206,10 +192,7 @@ def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) ->
 
 
 def validated_face_indices(topology: Topology, indices: ArrayLike, noun: str, source: CageSource) -> IntArray:
-    """Check 0-based faces, and return them sorted, without repetitions. Messages call a face ``noun``.
-
-    Raises CageError if an index is not an integer or out of range.
-    """
+    """Check 0-based faces, and return them sorted, without repetitions. Messages call a face ``noun``."""
     faces = _integers(_flat(indices, f"{noun}s", source), f"{noun}s", source)
     for row in np.flatnonzero((faces < 0) | (faces >= topology.face_count))[:1]:
         raise CageError(
@@ -305,10 +288,7 @@ def validated_tags(
 ) -> Sharpness:
     """Check creases and corners. If an edge or vertex occurs more than once, its last sharpness is used.
 
-    As in OpenSubdiv, creases and corners at edges and vertices that do not exist are ignored.
-
-    Raises CageError if vertices are not integers, or a sharpness is negative or NaN. Warns if creases or corners are
-    ignored.
+    As in OpenSubdiv, creases and corners at edges and vertices that do not exist are ignored, with a warning.
     """
     edges = _table(creases, 3, "creases", "(vertex, vertex, sharpness)", source)
     vertices = _table(corners, 2, "corners", "(vertex, sharpness)", source)
@@ -341,10 +321,7 @@ def validated_tags(
 
 
 def validated_edges(topology: Topology, edges: ArrayLike, source: CageSource) -> IntArray:
-    """Check edges, given as pairs of vertices, and return a half-edge of each.
-
-    Raises CageError if a pair is not an edge of two faces, or occurs twice.
-    """
+    """Check different edges of two faces, given as pairs of vertices, and return a half-edge of each."""
     t, ends = topology, np.asarray(edges)
     if ends.size and (ends.dtype.kind not in "iu" or ends.shape != (len(ends), 2)):
         raise CageError(f"{source.name}: edges of shape {ends.shape} and type {ends.dtype}; expected integers, (n, 2)")

@@ -60,7 +60,7 @@ def _polynomials(patches: PatchTable, grid: AdaptiveGrid) -> tuple[VertexPolynom
     """The polynomials on which vertices lie. Vertices at equal parameters of patches of one class share a sample."""
     refined = patches.refined
     table = patches if refined is None else refined.table
-    tile, uv = grid.vertex_parameters()
+    tile, uv = grid.parameters()
     corner = grid.tiles["corner"][tile]
     # Face h of the cage refined once lies at half-edge h of the cage, and begins there.
     patch_class, patch, _ = table.patch_at(corner if refined is None else table.topology.face_offsets[corner])

@@ -336,8 +336,12 @@ class AdaptiveGrid:
         begin, end = self.sides.begin[side], self.sides.end[side]
         return (self.position[samples] - begin) / (end - begin)
 
-    def _parameters(self, samples: IntArray | slice) -> tuple[IndexArray, FloatArray]:
-        """The tile of some samples on sides and of all inner ones, and their parameters ``(2, n)`` in its patch."""
+    def parameters(self, samples: IntArray | slice | None = None) -> tuple[IndexArray, FloatArray]:
+        """The tile of some samples on sides and of all inner ones, and their parameters ``(2, n)`` in its patch.
+
+        By default of the samples that number the vertices.
+        """
+        samples = self._numbers[1] if samples is None else samples
         tile, side = np.divmod(self._side[samples], self.side_counts.shape[1])
         corners = self.frames.domain.corners
         steps = np.roll(corners, -1, axis=0) - corners
@@ -346,10 +350,6 @@ class AdaptiveGrid:
         inside = inner_steps(self.tiles["rates"], len(corners)).T / self.tiles["rates"][inner].T
         tile = np.concatenate([tile, inner])
         return tile, in_patch(self.tiles, tile, np.concatenate([on_sides, inside], axis=1))
-
-    def vertex_parameters(self) -> tuple[IndexArray, FloatArray]:
-        """Locate each vertex in one of its tiles. Returns the tile, (n,), and (2, n) parameters in the tile's patch."""
-        return self._parameters(self._numbers[1])
 
     def _seen(self, tile: IntArray, near: FloatArray, *points: FloatArray) -> tuple[IntArray, list[FloatArray]]:
         """Locate points in elements, from parameters ``(2, n)`` in patches.
@@ -374,14 +374,14 @@ class AdaptiveGrid:
 
         Returns a corner of an element, (m,) int32, and parameters in the element that start there, (m, 3, 2) float64.
         """
-        tile, (_, samples) = self._tile(), self._parameters(slice(None))
+        tile, (_, samples) = self._tile(), self.parameters(slice(None))
         middle = in_patch(self.tiles, tile, np.full((2, len(tile)), 1 / self.frames.domain.corner_count))
         corner, uv = self._seen(tile, middle, *(samples[:, column] for column in self._sample_triangles().T))
         return corner.astype(np.int32), np.stack(uv, axis=1)
 
     def locations(self) -> tuple[IntArray, FloatArray]:
         """See `UniformGrid.locations`."""
-        tile, parameters = self.vertex_parameters()
+        tile, parameters = self.parameters()
         corner, (uv,) = self._seen(tile, parameters, parameters)
         return corner.astype(np.int64), uv
 
