@@ -1,11 +1,80 @@
-"""The scenes against their references, and the references themselves."""
+"""Scenes against their references, what the tiers see of defects put in on purpose, and the references themselves."""
 
+from dataclasses import replace
+
+import mitsuba as mi
 import pytest
+from mitsuba_subdivision.regression.compare import compare
 from mitsuba_subdivision.regression.image import load_image
-from regression.defects import RESOLUTION, SCENES
+from mitsuba_subdivision.regression.references import compare_scene, render_like
+from mitsuba_subdivision.regression.tiers import Status, Tolerances
+from regression.defects import DEFECTS, RESOLUTION, SCENES, scene_of
 
 REFERENCES = SCENES.parent / "renders" / "references"
 LARGEST, ALL_BYTES = 96, 5_000_000
+# Tiers that must fail for each defect. Geometry is the probe's; of the radiance tiers, the tile tier sees at 256
+# samples what changes a whole image, or turns a patch dark.
+CAUGHT_BY = {
+    "albedo + 1 %": {"paired", "tile"},
+    "normals of a patch turned by 0.1 degrees": {"probe", "paired"},
+    "one vertex moved by 1e-3": {"probe", "paired"},
+    "Stam's form": {"probe", "paired", "tile"},
+    "a weight wrong by 1e-3": {"probe", "paired"},
+}
+
+
+@pytest.fixture(scope="module", params=[3, 5], ids="valence{}".format)
+def valence(request):
+    return request.param
+
+
+@pytest.fixture
+def reference(valence, variant_llvm_ad_rgb):  # noqa: ARG001 - the variant must be set
+    result = load_image(REFERENCES / f"valence{valence}.exr")
+    # The scenes below are loaded, with their parameters.
+    assert result.metadata["parameters"] == {"resolution": str(RESOLUTION)}
+    return replace(result, metadata={**result.metadata, "parameters": {}})
+
+
+def failing(result):
+    # On another machine than the reference's, the paired tier only warns.
+    return {tier.name for tier in result.tiers if tier.status in (Status.FAIL, Status.WARN)}
+
+
+# Stam's form is another number at each valence, the others change both scenes alike.
+@pytest.mark.parametrize(
+    ("valence", "name"), [*((5, name) for name in DEFECTS), (3, "Stam's form")], indirect=["valence"]
+)
+def test_defects_are_caught(reference, valence, name):
+    result = compare_scene(reference, DEFECTS[name](valence))
+    assert result.status is Status.FAIL
+    assert failing(result) == CAUGHT_BY[name], str(result)
+
+
+@pytest.mark.parametrize("valence", [3], indirect=True)
+@pytest.mark.parametrize(("load", "status"), [(scene_of, Status.PASS), (DEFECTS["albedo + 1 %"], Status.FAIL)])
+def test_the_tile_tier_is_sure_of_one_per_cent_and_of_nothing(reference, valence, load, status):
+    """At the usual 256 samples."""
+    scene = load(valence)
+    result = [compare(reference, render_like(reference, scene, seed=seed), ["tile"]) for seed in (0, 1)]
+    assert [str(comparison) for comparison in result if comparison.status is not status] == []
+
+
+@pytest.mark.parametrize("valence", [5], indirect=True)
+def test_a_failure_by_chance_gets_a_second_attempt(reference, valence):
+    # At this level about every second image fails.
+    strict = {**reference.metadata["tolerances"], "alpha": 0.9, "floor_relative": 0.0}
+    tried = compare_scene(reference, scene_of(valence), ["tile"], 64, Tolerances().with_values(strict))
+    samples = int(tried.test.estimate.count.max())
+    assert (samples == 256) == any("second attempt" in note for note in tried.notes)
+
+
+@pytest.mark.parametrize("valence", [5], indirect=True)
+def test_scalar_and_llvm_see_the_same_geometry(reference, valence):
+    """Other samples, so the tile tier decides on the pixels."""
+    mi.set_variant("scalar_rgb")
+    tiers = compare_scene(reference, scene_of(valence), spp=64).tiers
+    assert [(t.name, t.status.value) for t in tiers] == [("probe", "pass"), ("paired", "skipped"), ("tile", "pass")]
 
 
 @pytest.mark.parametrize("name", ["valence3", "valence5", "rook", "barrel"])

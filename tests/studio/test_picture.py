@@ -1,4 +1,6 @@
-"""Shading and triangles that scenes of this package have by default."""
+"""Shading and triangles that scenes of this package have by default, and pictures that Open Image Denoise denoises."""
+
+import sys
 
 import mitsuba as mi
 import mitsuba_subdivision as msub
@@ -6,6 +8,8 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import named_cages
+from mitsuba_subdivision.regression.image import load_image
+from mitsuba_subdivision.regression.scene import BOX, load_scene, render_pixels
 from mitsuba_subdivision.shapes import interaction_hook
 from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import StillPicture, Turntable
@@ -17,6 +21,16 @@ exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()
 llvm = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 CUBE = named_cages.cube()
 SMALL = ["--size", "20x15", "--spp", "4"]
+# Of the error by as many samples, at most: measured 0.34.
+LEFT = 0.6
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    """Name of a file of the cube in the working folder."""
+    monkeypatch.chdir(tmp_path)
+    CUBE.save("cube.obj")
+    return "cube.obj"
 
 
 @exact
@@ -70,23 +84,45 @@ def test_scalar_variants_keep_normals_of_vertices_and_say_so_once(capfd):
 
 @pytest.mark.parametrize("words", [[], ["--turntable", "2"], ["--rate", "2"]])
 @llvm
-def test_the_command_says_once_what_it_does_elsewhere(tmp_path, monkeypatch, capfd, words):
-    CUBE.save(tmp_path / "cube.obj")
-    monkeypatch.chdir(tmp_path)
+def test_the_command_says_once_what_it_does_elsewhere(file, monkeypatch, capfd, words):
     monkeypatch.setattr(interaction_hook, "hook_problem", lambda: "needs another computer")
-    assert main(["render", "cube.obj", "-o", "a.png", *SMALL, *words, "-m", "llvm_ad_rgb"]) == 0
+    assert main(["render", file, "-o", "a.png", *SMALL, *words, "-m", "llvm_ad_rgb"]) == 0
     assert capfd.readouterr().err.count("exact shading needs another computer\n") == 1
-    assert main(["render", "cube.obj", "-o", "b.png", *SMALL, *words, "--shading", "vertex", "-m", "llvm_ad_rgb"]) == 0
+    assert main(["render", file, "-o", "b.png", *SMALL, *words, "--shading", "vertex", "-m", "llvm_ad_rgb"]) == 0
     assert "exact shading" not in capfd.readouterr().err
 
 
 @exact
 @llvm
-def test_scenes_that_are_saved_do_not_follow_their_sensor(tmp_path, monkeypatch):
+def test_scenes_that_are_saved_do_not_follow_their_sensor(file, tmp_path):
     """It is to be edited."""
-    CUBE.save(tmp_path / "cube.obj")
-    monkeypatch.chdir(tmp_path)
-    assert main(["render", "cube.obj", "-o", "a.png", *SMALL, "--save-scene", "a.xml", "-m", "llvm_ad_rgb"]) == 0
+    assert main(["render", file, "-o", "a.png", *SMALL, "--save-scene", "a.xml", "-m", "llvm_ad_rgb"]) == 0
     text = (tmp_path / "a.xml").read_text()
     assert "adaptive" not in text
     assert '<string name="shading" value="exact"/>' in text
+
+
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_denoising_removes_noise():
+    pytest.importorskip("mitsuba_oidn")
+    scene = msub.studio_scene(CUBE, size=(48, 36), rate=2)
+    expected, noisy = (render_pixels(load_scene(scene, None, BOX).scene, seed, spp) for seed, spp in ((1, 128), (2, 8)))
+    result = msub.render_denoised(scene, 8, 2)
+    assert result.shape == expected.shape
+    np.testing.assert_array_equal(result[..., 3:], noisy[..., 3:])
+    error, before = (np.sqrt(np.mean((image - expected)[..., :3] ** 2)) for image in (result, noisy))
+    assert error < LEFT * before
+
+
+def test_denoised_pictures_are_no_references(file, capsys):
+    pytest.importorskip("mitsuba_oidn")
+    assert main(["render", file, "-o", "a.exr", *SMALL, "-m", "scalar_rgb", "--denoise"]) == 0
+    assert load_image("a.exr").metadata["denoised"]
+    assert main(["compare", "a.exr", "a.exr"]) == 3
+    assert '"a.exr" is denoised, which removes what is compared; expected one as rendered' in capsys.readouterr().err
+
+
+def test_a_missing_denoiser_names_the_extra(file, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
+    assert main(["render", file, "-o", "a.png", "--denoise"]) == 1
+    assert 'pip install "mitsuba-subdivision[denoise]"' in capsys.readouterr().err

@@ -1,7 +1,8 @@
-"""Text of small USD stages, and what is told of them."""
+"""Text of small USD stages, what is told of them, and a sensor that looks at small scenes."""
 
 import warnings
 
+import mitsuba as mi
 from mitsuba_subdivision.cage import CageWarning
 
 CORNERS = "(-1,-1,-1), (1,-1,-1), (-1,1,-1), (1,1,-1), (-1,-1,1), (1,-1,1), (-1,1,1), (1,1,1)"
@@ -91,3 +92,13 @@ def told(call, *given, **options):
     messages = [str(warning.message) for warning in record]
     assert all(issubclass(warning.category, CageWarning) for warning in record), messages
     return result, messages
+
+
+WIDTH, FOV = 640, 30.0
+
+
+def sensor_at(distance, width=WIDTH):
+    """Looks along z from so far in front of the origin."""
+    film = {"type": "hdrfilm", "width": width, "height": width // 2}
+    view = {"type": "perspective", "fov": FOV, "fov_axis": "x", "near_clip": 0.01, "film": film}
+    return {**view, "to_world": mi.ScalarTransform4f().translate([0, 0, -distance])}

@@ -20,7 +20,7 @@ from mitsuba_usd.copies import LARGE, LEAST_INSTANCES, with_copies, with_large_c
 from mitsuba_usd.picture_detail import segments_of, triangles_for_picture
 from mitsuba_usd.scene_entries import DENSE, Surfaces, subdivision
 from mitsuba_usd.stage_warnings import StageWarnings
-from usd.sensors import FOV, WIDTH, sensor_at
+from usd.stages import FOV, WIDTH, sensor_at
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 

@@ -20,7 +20,7 @@ from mitsuba_usd.picture_detail import TEXELS_PER_PIXEL, texels_for_pictures
 from mitsuba_usd.stage_warnings import StageWarnings
 from mitsuba_usd.texture_image import read_texture_image, reduced
 from mitsuba_usd.textures import Textures
-from usd.sensors import FOV, WIDTH, sensor_at
+from usd.stages import FOV, WIDTH, sensor_at
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 
