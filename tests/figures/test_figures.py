@@ -23,14 +23,16 @@ from mitsuba_subdivision.figures.cages import (
     regular_elements,
 )
 from mitsuba_subdivision.figures.characteristic import (
+    bent_ball,
     characteristic_points,
+    growth,
+    largest_by_level,
     on_patch,
     patch_of_valence,
     refinement_step,
     sector,
     sub_domain,
 )
-from mitsuba_subdivision.figures.curvature import bent_ball, growth, largest_by_level
 from mitsuba_subdivision.figures.fit import DIAGONAL, ball_cage, distances, in_front
 from mitsuba_subdivision.figures.normal_error import ZOOM_OFFSET, ZOOM_VALENCE, normals_by, offset_cage, panel_samples
 from mitsuba_subdivision.figures.output import write_figure

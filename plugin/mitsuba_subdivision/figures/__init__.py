@@ -68,7 +68,7 @@ FIGURES: dict[str, Figure] = {
     ),
     "zoom": Figure("normal_error.draw_zoom", "an extraordinary vertex, magnified up to a million times", ("spp",)),
     "zebra": Figure("zebra.draw", "reflection lines, with exact normals and with others", ("spp", "cage")),
-    "curvature": Figure("curvature.draw", "curvature around extraordinary vertices", ("cage",)),
+    "curvature": Figure("characteristic.draw_curvature", "curvature around extraordinary vertices", ("cage",)),
     "fit": Figure("fit.draw", "cages fitted to pictures, and how near they come", ("spp",)),
     "hero": Figure("scenes.draw_hero", "a human figure and its control cage", ("spp",)),
 }
