@@ -1,15 +1,18 @@
 // OpenSubdiv's limit surface of any cage at given parameters.
 //
-//   osd_peer QUERIES ANSWERS [--method far|refine] [--level n] [--real float|double] [--scheme catmark|loop]
+//   osd_peer QUERIES ANSWERS [--method far|bfr|refine] [--level n] [--real float|double] [--scheme catmark|loop]
 //            [--boundary none|edge_only|edge_and_corner] [--creasing uniform|chaikin]
 //            [--triangles catmark|smooth] [--fvar all|none|boundaries|corners_only|corners_plus1|corners_plus2]
 //
 //   far      adaptive refinement to the level, a patch table with Gregory end caps, EvaluateBasis
+//   bfr      Bfr::Surface of each face that is asked for, which approximates smooth features at the level; without
+//            face-varying values, for the figure of reflection lines
 //   refine   uniform refinement to the level and limit masks: only parameters that are vertices of that level have a
 //            value; du and dv are two tangents at the vertex, whatever the directions of its edges
 #include "peer_common.h"
 #include <array>
 #include <memory>
+#include <opensubdiv/bfr/refinerSurfaceFactory.h>
 #include <opensubdiv/far/patchMap.h>
 #include <opensubdiv/far/patchTableFactory.h>
 #include <opensubdiv/far/primvarRefiner.h>
@@ -172,6 +175,47 @@ private:
     std::vector<R> points_, fvar_points_;
 };
 
+template <class R> class BfrSurface {
+public:
+    BfrSurface(const Cage &cage, const Arguments &a, const Queries &queries)
+        : cage_(cage), refiner_(make_refiner(cage, a)), surface_(cage.face_count()), points_(cage.face_count()) {
+        typename Bfr::RefinerSurfaceFactory<>::Options options;
+        options.SetApproxLevelSmooth(a.number("level", 2));
+        Bfr::RefinerSurfaceFactory<> factory(*refiner_, options);
+        std::vector<R> values(cage.values.begin(), cage.values.end());
+        for (int f : queries.face) {
+            if (surface_[f].IsValid() || !factory.InitVertexSurface(f, &surface_[f])) continue;
+            points_[f].resize(size_t(surface_[f].GetNumPatchPoints()) * cage.width);
+            surface_[f].PreparePatchPoints(values.data(), cage.width, points_[f].data(), cage.width);
+        }
+    }
+
+    void answer(const Queries &queries, int i, Answers &answers) {
+        const int f = queries.face[i], w = cage_.width;
+        if (points_[f].empty()) return;
+        R uv[2] = {R(queries.uv[2 * i]), R(queries.uv[2 * i + 1])}, out[3][64];
+        double scale = 1;
+        auto parameters = surface_[f].GetParameterization();
+        if (parameters.HasSubFaces()) {
+            R on_sub_face[2] = {uv[0], uv[1]};
+            parameters.ConvertNormalizedSubFaceToCoord(queries.sub[i], on_sub_face, uv);
+            scale = 0.5;   // as for Far
+        }
+        surface_[f].Evaluate(uv, points_[f].data(), w, out[0], out[1], out[2]);
+        for (int k = 0; k < w; ++k) {
+            answers.p[size_t(i) * w + k] = out[0][k];
+            answers.du[size_t(i) * w + k] = scale * out[1][k];
+            answers.dv[size_t(i) * w + k] = scale * out[2][k];
+        }
+    }
+
+private:
+    const Cage &cage_;
+    std::unique_ptr<Refiner> refiner_;
+    std::vector<Bfr::Surface<R>> surface_;
+    std::vector<std::vector<R>> points_;
+};
+
 // Faces of a level with what they are a part of: a face of the cage or a polygon's sub-face, and their corners' (u, v)
 // on it.
 struct Part {
@@ -293,6 +337,7 @@ private:
 template <class R> void run_in(const Arguments &a, const Cage &cage, const Queries &queries, Answers &answers) {
     std::string method = a.text("method", "far");
     if (method == "far") run<FarSurface<R>>(a, cage, queries, answers);
+    else if (method == "bfr") run<BfrSurface<R>>(a, cage, queries, answers);
     else if (method == "refine") run<RefinedSurface<R>>(a, cage, queries, answers);
     else fail("unknown --method " + method);
 }
