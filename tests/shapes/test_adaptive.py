@@ -135,7 +135,7 @@ def test_sensors_of_other_kinds_are_refused():
 
 
 @llvm
-@pytest.mark.parametrize(("count", "message"), [(21, "21 coordinates; expected"), (24, "expected finite numbers")])
+@pytest.mark.parametrize(("count", "message"), [(21, "21 numbers; expected"), (24, "expected finite numbers")])
 @pytest.mark.parametrize("limit", [{"chord_error": 1e-1}, {}], ids=["chord_error", "None"])
 def test_control_points_that_are_wrong_choose_no_triangles(count, message, limit):
     shape = make(cube(), chord_error=1e-2)

@@ -132,7 +132,7 @@ def points_with(*values):
     return np.array([*points[:7], *values, *points[7 + len(values) :]])
 
 
-VERTEX, FINITE = "vertex 2 has the coordinates", "expected finite numbers"
+VERTEX, FINITE = "control point 2 is", "expected finite numbers"
 TEXTURED = cube(texcoords=cube().positions[:, :2], attributes={"tint": np.ones((8, 3))})
 FAR = CAGE.with_positions(CAGE.positions + 1000)
 PLAIN, AWAY, SEEN = ((cage, {"tessellation_rate": 2}) for cage in (CAGE, FAR, TEXTURED))
@@ -144,14 +144,14 @@ PLAIN, AWAY, SEEN = ((cage, {"tessellation_rate": 2}) for cage in (CAGE, FAR, TE
         (PLAIN, "to_world", np.diag([1, 0, 1, 1]), "has the determinant 0.0; expected an invertible matrix"),
         (PLAIN, "to_world", np.diag([np.inf, 1, 1, 1]), "has the determinant inf; expected an invertible matrix"),
         (PLAIN, "to_world", 2 * np.eye(4), "has the last row (0.0, 0.0, 0.0, 2.0); expected (0, 0, 0, 1)"),
-        (PLAIN, "control_points", points_with(np.nan), f"{VERTEX} (-1.0, nan, -1.0); {FINITE} (1 such vertex in all)"),
+        (PLAIN, "control_points", points_with(np.nan), f"{VERTEX} (-1.0, nan, -1.0); {FINITE} (1 such in all)"),
         (
             *(PLAIN, "control_points", points_with(np.inf, -np.inf, np.nan, np.nan)),
-            f"{VERTEX} (-1.0, inf, -inf); {FINITE} (2 such vertices in all)",
+            f"{VERTEX} (-1.0, inf, -inf); {FINITE} (2 such in all)",
         ),
-        *((made, "control_points", np.zeros(21), "21 coordinates; expected 24") for made in (PLAIN, AWAY)),
-        (PLAIN, "cage_tint", np.ones(23), "23 numbers; expected 24, 3 for each of 8 values at the cage"),
-        (PLAIN, "cage_tint", [*np.ones(22), np.inf, np.inf], f"number 22 is not finite; {FINITE} (2 such in all)"),
+        *((made, "control_points", np.zeros(21), "21 numbers; expected 24") for made in (PLAIN, AWAY)),
+        (PLAIN, "cage_tint", np.ones(23), "23 numbers; expected 24, 3 for each of 8 values"),
+        (PLAIN, "cage_tint", [*np.ones(22), np.inf, np.inf], f"value 7 is (1.0, inf, inf); {FINITE} (1 such in all)"),
         ((CAGE, OF_HEIGHTS), "displacement_scale", [np.nan], "[nan] was given; expected a finite number"),
         ((CAGE, {**ADAPTIVE, "chord_error": 0.1}), "chord_error", [-1.0], "is -1.0; expected a number above 0"),
         # Mitsuba would read and write beyond the end of these.

@@ -25,12 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import warn
-from ..device_arrays import take_over, upload
+from ..device_arrays import upload
 from ..kernels.array_types import ArrayTypes, Float, FloatBuffer, Index, Mask, Value
 from ..mesh.shared import Shared, SharedArray
 from ..variants import Variant
 from .derivatives import Watched, computed_ones, warn_of_lost
-from .device_state import flat_type, is_recording
+from .device_state import flat_type, require_values
 from .parameter_table import errors_about
 
 if TYPE_CHECKING:
@@ -114,21 +114,20 @@ class CageAttributes:
         Returns list of str: names of the attributes. Raises ValueError if the number of values has changed, or one is
         not finite.
         """
-        names = [name for name in self._channels if f"{PREFIX}{name}" in keys]
-        for name in names:
+        channels = {name: channel for name, channel in self._channels.items() if f"{PREFIX}{name}" in keys}
+        for name, channel in channels.items():
             with errors_about(f"{PREFIX}{name}"):
-                self._require_values(name)
-        for name in names:
+                require_values(self.values[f"{PREFIX}{name}"], len(channel.values), channel.values.shape[1], "value")
+        for name in channels:
             values = self.values[f"{PREFIX}{name}"]
             self._computed[name] = computed_ones(values) if dr.grad_enabled(values) else set()
             self._move(name)
-        return names
+        return list(channels)
 
     def renew(self, name: str, gradient: FloatBuffer) -> None:
         """Attach an attribute's followers and buffers to its values again, after reverse mode has reached these."""
-        lost = self._computed[name] - computed_ones(self.values[f"{PREFIX}{name}"])
-        if lost and not is_recording() and dr.any(gradient != 0):
-            warn_of_lost(self._source, f"{PREFIX}{name}")
+        parameter = f"{PREFIX}{name}"
+        warn_of_lost(self._source, parameter, [self.values[parameter]], self._computed[name], [gradient])
         self._move(name)
 
     def buffers(self, names: Iterable[str] | None = None) -> dict[str, FloatBuffer]:
@@ -183,19 +182,6 @@ class CageAttributes:
         self._moved[name] = values
         if name in self._followers:
             self._followers[name](values)
-
-    def _require_values(self, name: str) -> None:
-        values, (count, size) = self.values[f"{PREFIX}{name}"], self._channels[name].values.shape
-        if dr.width(values) != count * size:
-            raise ValueError(
-                f"{dr.width(values)} numbers; expected {count * size}, {size} for each of {count} values at the cage"
-            )
-        if is_recording():
-            return
-        take_over(values)
-        if not dr.all(dr.isfinite(values)):
-            invalid = np.flatnonzero(~np.isfinite(np.array(dr.detach(values))))
-            raise ValueError(f"number {invalid[0]} is not finite; expected finite numbers ({len(invalid)} such in all)")
 
 
 def mesh_name(name: str) -> str:

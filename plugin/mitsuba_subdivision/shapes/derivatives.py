@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import drjit as dr
@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from ..cage.errors import warn
 from ..kernels.array_types import Float
+from .device_state import is_recording
 
 # Number of bits of a Dr.Jit variable index. The index of its derivative is in the bits above.
 _HALF = 32
@@ -37,14 +38,22 @@ class Watched(dr.CustomOp):
         return "Watched"
 
 
-def warn_of_lost(name: str, parameters: str) -> None:
-    """Warn that a gradient has reached parameters of a shape, but not the variables that they were computed from."""
-    warn(
-        f"{name}: gradients came to {parameters} a second time since the last update, and could not go on to the "
-        "variables that these were computed from, as Dr.Jit forgets a computation once gradients have passed through "
-        "it; assign the parameters and update before each view, or differentiate one loss of all views, as "
-        "loss_of_views computes it"
-    )
+def warn_of_lost(
+    name: str,
+    parameters: str,
+    arrays: Iterable[Any],  # Of the parameters
+    computed: set[int],  # Their `computed_ones` at the last update
+    gradients: Iterable[Any],  # Zero for shapes of scenes that are no longer used
+) -> None:
+    """Warn if a gradient has reached parameters of a shape, but not the variables that they were computed from."""
+    is_lost = bool(computed - computed_ones(*arrays)) and not is_recording()
+    if is_lost and any(dr.any(gradient != 0, axis=None) for gradient in gradients):
+        warn(
+            f"{name}: gradients came to {parameters} a second time since the last update, and could not go on to the "
+            "variables that these were computed from, as Dr.Jit forgets a computation once gradients have passed "
+            "through it; assign the parameters and update before each view, or differentiate one loss of all views, "
+            "as loss_of_views computes it"
+        )
 
 
 def loss_of_views(

@@ -16,7 +16,10 @@ from types import MethodType, SimpleNamespace
 from typing import Any
 
 import drjit as dr
+import numpy as np
 
+from ..device_arrays import take_over
+from ..kernels.array_types import FloatBuffer
 from ..mesh.shared import SharedArray
 from ..variants import Variant
 
@@ -78,6 +81,27 @@ def _collector(variant: Variant) -> type:
             self.shown.append((name, value, cpp_type))
 
     return Collector
+
+
+def require_values(
+    values: FloatBuffer,  # Of a parameter, flat
+    count: int,
+    size: int,  # Number of components of a value
+    kind: str,  # What a value is called in messages
+    *,
+    are_new: bool = True,  # Whether they may be others than before
+) -> None:
+    """Check the number of values, and that new ones are finite; move these to Dr.Jit's memory. Raises ValueError."""
+    if dr.width(values) != count * size:
+        raise ValueError(f"{dr.width(values)} numbers; expected {count * size}, {size} for each of {count} {kind}s")
+    if is_recording() or not are_new:
+        return
+    take_over(values)
+    if not dr.all(dr.isfinite(values)):
+        rows = np.array(dr.detach(values)).reshape(count, size)
+        invalid = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+        first = ", ".join(map(str, rows[invalid[0]].tolist()))
+        raise ValueError(f"{kind} {invalid[0]} is ({first}); expected finite numbers ({len(invalid)} such in all)")
 
 
 class DeviceState:

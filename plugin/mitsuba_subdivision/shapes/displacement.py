@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from scipy import sparse
 
     from ..patches import Channel
-    from ..tessellation.attribute_table import AttributeTable
+    from ..tessellation.attribute_table import AttributeLayout
     from .exact_shading import ExactShading
 
 # Step of central differences of a texture, in texture coordinates.
@@ -91,7 +91,7 @@ class ShapeDisplacement:
             self.kernel = SurfaceKernel(surface.pieces(), variant.Float)
             self.kernel.values.load(positions)
         if self.kernel is not None:
-            channel = ChannelKernel(self._channel, variant.Float) if exact is None else exact.channel(self.attribute)
+            channel = ChannelKernel(self._channel, variant.Float) if exact is None else exact.channels[self.attribute]
             self.kernel.displacement = Displacement(channel, self.heights, scale)
         self.take_scale(self.checked_scale())
 
@@ -319,7 +319,7 @@ class DisplacedVertices:
 
     def __init__(
         self,
-        split: AttributeTable,  # Vertices with copies along seams, whose different displacements are averaged
+        layout: AttributeLayout,  # Vertices with copies along all seams, whose different displacements are averaged
         weld_target: NDArray[np.uint32] | None,  # Their `split_weld_targets`
         surface: LimitSurface,
         displacement: ShapeDisplacement,
@@ -331,7 +331,7 @@ class DisplacedVertices:
         self._types: Any = types
         # (n,) int64: corner of an element from which parameters are seen, a half-edge of `PatchTable.elements`; and
         # (n, 2) float64: parameters. Samples at corners of elements have (0, 0).
-        self._corner, self._uv = corner, uv = split.layout.locate()
+        self._corner, self._uv = corner, uv = layout.locate()
         self._mean: Any = None if weld_target is None else _mean_over_copies(weld_target)
         # (n,) bool: whether the slope of heights along the surface exists. It does not exist at an extraordinary point
         # where a seam ends, as positions and values contract at different rates.

@@ -15,14 +15,12 @@ from ..device_arrays import upload
 from ..kernels.algebra import AffineMap, added, dot, over
 from ..kernels.array_types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Value, Vector2, Vector3
 from ..kernels.line_intersection import ON_LINE, Lines
-from ..kernels.linear_maps import ControlValues
 from ..kernels.locations import Location, TriangleLocations
 from ..kernels.surface_kernel import SurfaceKernel, SurfacePoints
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
-from ..tessellation.attribute_table import AttributeLayout, AttributeTable
 from ..variants import Variant
 from .cage_attributes import WIDTHS, mesh_name, spectral_upsampling
 from .placement import Placement
@@ -43,7 +41,6 @@ _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 
 # Locations on triangles, shared by shapes with the same tessellation and elements.
 _TRIANGLES: Shared[TriangleLocations] = Shared()
-_WELDED: Shared[AttributeLayout] = Shared()
 # Number of fixed-point iterations of `hit_by_texcoords`. Each removes most of the difference between texture
 # coordinates on the surface and on its triangles.
 STEPS = 3
@@ -74,14 +71,19 @@ class ExactShading:
         self.kernel.values.load(positions)
         self.to_world: Matrix4 = self.kernel.types.matrix4(1)  # For points relative to the centre
         self._counts: IndexBuffer = dr.zeros(self.kernel.types.index, len(_KINDS))
-        self._limit_surface = surface
-        self._channels: dict[str, ChannelKernel] = {}
-        self._texcoords = self.channel(TEXCOORDS) if TEXCOORDS in surface.attribute_names else None
-        self._attributes = {
-            mesh_name(name): self.channel(name)
-            for name, attribute in surface.cage.attributes.items()
-            if attribute.values.shape[1] in WIDTHS
-        }
+        # Texture coordinates and attributes that are evaluated at hits, by their names in the cage
+        self.channels: dict[str, ChannelKernel] = {}
+        if surface.attribute_names:
+            from ..kernels.channel_kernel import ChannelKernel
+
+            channels = {name: surface.channel(name) for name in surface.attribute_names}
+            self.channels = {
+                name: ChannelKernel(channel, variant.Float)
+                for name, channel in channels.items()
+                if name == TEXCOORDS or channel.values.shape[1] in WIDTHS
+            }
+        self._texcoords = self.channels.get(TEXCOORDS)
+        self._attributes = {mesh_name(name): channel for name, channel in self.channels.items() if name != TEXCOORDS}
         sizes = {name: channel.values.size for name, channel in self._attributes.items()}
         self._upsampling = spectral_upsampling(variant, sizes)
         self._shape: Callable[[], mi.Mesh | None] = lambda: None
@@ -98,27 +100,6 @@ class ExactShading:
         if self._kept is not None:
             triangle = dr.gather(self.kernel.types.index, self._kept, triangle, active)
         return self._triangles(triangle, b1, b2, active)
-
-    def welded_table(self, table: VertexTable) -> AttributeTable:
-        """Triangles without copies of vertices, for normals and texture coordinates that are evaluated at hits.
-
-        Attributes at a vertex on a seam have the value of one side.
-        """
-        surface = self._limit_surface
-        if not surface.cage.attributes:
-            return AttributeTable(_welded(table), {})
-        split = surface.attribute_table(table)
-        values = {name: split.values[name] for name in surface.cage.attributes}
-        if split.layout.surface_vertex is None:
-            return AttributeTable(_welded(table), values)
-        _, first = np.unique(split.layout.surface_vertex, return_index=True)
-
-        def first_ones() -> tuple[IntArray, FloatArray]:
-            start, uv = split.layout.locate()
-            return start[first], uv[first]
-
-        layout = _welded(table, split.layout, first_ones)
-        return AttributeTable(layout, {name: value[first] for name, value in values.items()})
 
     def follow(self, shape: mi.Mesh) -> None:
         """Use a shape's current material at each hit, and the orientation of its normals, without keeping it alive."""
@@ -138,26 +119,13 @@ class ExactShading:
         self.to_world[:] = self.kernel.types.matrix4(to_world)
         self._map = AffineMap.of(dr.detach(self.to_world), self.kernel.types.matrix4(placement.inverse()))
 
-    def channel(self, name: str) -> ChannelKernel:
-        """Return the kernel of an attribute of the cage or of its texture coordinates, created at the first call."""
-        if name not in self._channels:
-            from ..kernels.channel_kernel import ChannelKernel
-
-            self._channels[name] = ChannelKernel(self._limit_surface.channel(name), self.kernel.types.float)
-        return self._channels[name]
-
-    @property
-    def values(self) -> dict[str, ControlValues]:
-        """Control values of texture coordinates and attributes evaluated on the surface, by names in the cage."""
-        return {name: channel.values for name, channel in self._channels.items()}
-
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose intermediate arrays: forward mode reaches a rendering only through arrays that are traversed."""
         differentiable = mi.ParamFlags.Differentiable
         callback.put("shading_coefficients", self.kernel.coefficients, differentiable)
         callback.put("shading_to_world", self.to_world, differentiable)
-        for name, values in self.values.items():
-            callback.put(f"shading_cage_{name}", values.flat, differentiable)
+        for name, channel in self.channels.items():
+            callback.put(f"shading_cage_{name}", channel.values.flat, differentiable)
 
     def complete(self, si: mi.SurfaceInteraction3f, triangle_hit: TriangleHit) -> None:
         """Complete the surface interaction at a hit on a triangle, in place."""
@@ -327,22 +295,6 @@ def _facing(n: Vector3, d: Vector3, facing: Float) -> Vector3:
     target_cosine = dr.select(facing < 0, -GRAZING, GRAZING)
     turned = added(detached, d, (target_cosine - cosine) * inverse)
     return dr.select(cosine * facing < 0, turned * dr.rsqrt(dot(turned, turned)), n)
-
-
-def _welded(
-    table: VertexTable,
-    split: AttributeLayout | None = None,  # Triangles with copies of vertices along seams, if there are seams
-    # Locations of the vertices of ``split`` that provide each vertex's attributes. By default the table's.
-    locate: Callable[[], tuple[IntArray, FloatArray]] | None = None,
-) -> AttributeLayout:
-    """Triangles without copies of vertices, shared between shapes."""
-
-    def triangles() -> NDArray[np.uint32]:
-        if not table.copies.size:
-            return table.triangles
-        return table.weld_target.astype(np.uint32)[table.triangles]
-
-    return _WELDED.get((table, split), lambda: AttributeLayout(None, triangles, locate or table.locations))
 
 
 def texture_scene(variant: Variant, shape: mi.Mesh, exact: ExactShading) -> mi.Scene:

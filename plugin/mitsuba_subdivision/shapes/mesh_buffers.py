@@ -11,20 +11,19 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device_arrays import mapped, take_over
+from ..device_arrays import mapped
 from ..kernels.array_types import ArrayTypes, FloatBuffer, IndexBuffer, LaterArrays, Matrix4
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared, SharedArray
 from ..surface import TEXCOORDS, LimitSurface
 from ..variants import Variant
 from .derivatives import Watched, computed_ones, warn_of_lost
-from .device_state import is_recording
 from .placement import Placement
 
 if TYPE_CHECKING:
     from ..kernels import VertexKernel
     from ..kernels.surface_kernel import SurfaceKernel
-    from ..tessellation.attribute_table import AttributeTable
+    from ..tessellation.attribute_table import AttributeLayout, AttributeTable
     from ..tessellation.vertex_table import VertexTable
     from .displacement import DisplacedVertices, ShapeDisplacement
     from .exact_shading import ExactShading
@@ -63,7 +62,7 @@ class MeshBuffers:
         # Method that is called with the gradients of the moving arrays, by name, after each reverse-mode pass
         on_backward: WeakMethod,
     ) -> None:
-        self._variant, self._attributes, self._kept = variant, attributes, kept
+        self._variant, self._kept = variant, kept
         self.table, self.layout, self._parameters = table, attributes.layout, parameters
         self._placement, self._shading, self._displacement = placement, shading, displacement
         self._on_backward = on_backward
@@ -86,26 +85,21 @@ class MeshBuffers:
         self._loaded: LaterArrays | None = None
         if self._kernel is not None and table.vertex_count <= MOST_SHARED:
             self._loaded = self._held["loaded"] = _LOADED.get((self._kernel, parameters.surface.cage), LaterArrays)
-        # Index of each vertex of the mesh among those of the tessellation, if seams have copies. Copies are displaced
-        # differently and averaged; with exact shading, only one of them is kept.
-        copied, one_of_copies = attributes.layout.surface_vertex, None
+        # Index of each vertex of the mesh among those of the tessellation, if seams have copies
+        copied = self.layout.surface_vertex
+        self._copied = copied if copied is None or self._types is None else self._types.indices(copied)
         self._displaced: DisplacedVertices | None = None
         if displacement is not None:
             from .displacement import DisplacedVertices
 
-            split = parameters.surface.attribute_table(table)
             self._displaced = DisplacedVertices(
-                split,
-                split_weld_targets(table, split),
+                self.layout,
+                split_weld_targets(table, self.layout),
                 parameters.surface,
                 displacement,
                 self._types,
                 has_normals=shading is None and not parameters.face_normals,
             )
-            if copied is None and split.layout.surface_vertex is not None:
-                _, one_of_copies = np.unique(split.layout.surface_vertex, return_index=True)
-            copied = split.layout.surface_vertex
-        self._copied, self._one_of_copies = self._index(copied), self._index(one_of_copies)
 
     def evaluated(
         self,
@@ -144,18 +138,13 @@ class MeshBuffers:
 
     def warn_of_lost(
         self,
-        # Gradients by the arrays computed from the parameters, by name. Zero for shapes of scenes that are no longer
-        # used.
-        gradients: dict[str, FloatBuffer | Matrix4],
+        gradients: dict[str, FloatBuffer | Matrix4],  # By the arrays computed from the parameters, by name
         control_points: FloatBuffer,
     ) -> None:
         """Warn if a gradient has reached the parameters, but not the variables that these were computed from."""
-        lost = self._computed - computed_ones(*self._sources(control_points))
-        if lost and not is_recording() and any(dr.any(gradient != 0, axis=None) for gradient in gradients.values()):
-            others = (
-                "control_points or to_world" if self._displacement is None else "control_points, to_world or heights"
-            )
-            warn_of_lost(self._parameters.source, others)
+        names = "control_points or to_world" if self._displacement is None else "control_points, to_world or heights"
+        sources = self._sources(control_points)
+        warn_of_lost(self._parameters.source, names, sources, self._computed, gradients.values())
 
     @property
     def _surface(self) -> SurfaceKernel | None:
@@ -170,42 +159,36 @@ class MeshBuffers:
         return [control_points, self._placement.matrix, *heights]
 
     def _on_host(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        """Evaluate positions and normals in NumPy.
-
-        Raises ValueError if the number of control points differs from that of the tessellation.
-        """
-        coordinates = np.array(dr.detach(points), dtype=np.float64)
-        _require_coordinates(coordinates.size, self.table.control_count)
+        """Evaluate positions and normals in NumPy."""
+        coordinates = np.array(dr.detach(points), dtype=np.float64).reshape(-1, 3)
         if not self._is_sampled:
-            positions, normals = self.table.apply(coordinates.reshape(-1, 3))
+            positions, normals = self.table.apply(coordinates)
             return positions.astype(np.float32).ravel(), normals.astype(np.float32).ravel()
         # Each vertex as a sample in float32, by the evaluator of the parameters, for comparison.
         given = self._parameters
-        cage = given.surface.cage.with_positions(coordinates.reshape(-1, 3))
+        cage = given.surface.cage.with_positions(coordinates)
         surface, how = LimitSurface(cage, given.surface.scheme), (given.evaluator, np.float32, given.sample_offset)
         p, n = surface.sample_vertices(self.table, *how)
         # The published forms may return NaN for the normal of parallel tangents; the kernel returns zero.
         n = np.nan_to_num(n)
         return (p.ravel(), n.ravel()) if self._types is None else (self._types.floats(p), self._types.floats(n))
 
-    def _index(self, index: IntArray | None) -> IntArray | IndexBuffer | None:
-        return index if index is None or self._types is None else self._types.indices(index)
-
-    def _selected(self, flat: FloatBuffer, index: IntArray | IndexBuffer | None) -> FloatBuffer:
-        """Select flat 3-vectors by index; all of them if there is no index."""
-        if index is None:
+    def _split(self, flat: FloatBuffer) -> FloatBuffer:
+        """Flat 3-vectors of all vertices of the mesh, from those of the tessellation."""
+        if self._copied is None:
             return flat
-        if self._types is None:
-            return np.reshape(flat, (-1, 3))[index].ravel()
-        return self._types.gathered(flat, index)
+        return (
+            flat.reshape(-1, 3)[self._copied].ravel()
+            if self._types is None
+            else self._types.gathered(flat, self._copied)
+        )
 
     def _placed(self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer) -> dict[str, FloatBuffer]:
         """Copy, displace and place vertices, and update exact shading."""
         placement, shading = self._placement, self._shading
-        positions, normals = self._selected(positions, self._copied), self._selected(normals, self._copied)
+        positions, normals = self._split(positions), self._split(normals)
         if self._displaced is not None:
             positions, normals = self._displaced(positions, normals, points)
-            positions, normals = (self._selected(flat, self._one_of_copies) for flat in (positions, normals))
         if not placement.is_identity:
             positions, normals = placement.placed(positions, normals)
         moved = {"vertex_positions": positions, "vertex_normals": normals}
@@ -237,7 +220,7 @@ class MeshBuffers:
     @property
     def weld_target(self) -> IndexBuffer | None:
         """See `split_weld_targets`; None if no vertex has copies."""
-        targets = partial(split_weld_targets, self.table, self._attributes)
+        targets = partial(split_weld_targets, self.table, self.layout)
         return self._shared("weld_target", (self.table, self.layout), targets, self._variant.UInt32)
 
     def _of_kept(self, of_triangles: NDArray) -> NDArray:
@@ -256,38 +239,11 @@ class MeshBuffers:
         return shared.array
 
 
-def require_control_points(control_points: FloatBuffer, count: int) -> None:
-    """Check flat coordinates of ``count`` control points on any device, and move them to Dr.Jit's memory.
-
-    Raises ValueError if their number differs, or a coordinate is not finite.
-    """
-    _require_coordinates(len(control_points), count)
-    if is_recording():
-        return
-    take_over(control_points)
-    if dr.all(dr.isfinite(control_points)):
-        return
-    points = np.array(control_points)
-    non_finite = np.unique(np.flatnonzero(~np.isfinite(points)) // 3)
-    coordinates = tuple(points[3 * non_finite[0] : 3 * non_finite[0] + 3].tolist())
-    raise ValueError(
-        f"vertex {non_finite[0]} has the coordinates {coordinates}; expected finite numbers "
-        f"({len(non_finite)} such {'vertex' if len(non_finite) == 1 else 'vertices'} in all)"
-    )
-
-
-def _require_coordinates(given: int, count: int) -> None:
-    if given != 3 * count:
-        from ..kernels.vertex_kernel import coordinates_expected
-
-        raise ValueError(coordinates_expected(given, count))
-
-
-def split_weld_targets(table: VertexTable, attributes: AttributeTable) -> NDArray[np.uint32] | None:
+def split_weld_targets(table: VertexTable, layout: AttributeLayout) -> NDArray[np.uint32] | None:
     """For each split vertex, the first split vertex at the same point; None if no vertex has copies."""
-    if attributes.layout.surface_vertex is None and not table.copies.size:
+    if layout.surface_vertex is None and not table.copies.size:
         return None
-    target = attributes.layout.gathered(table.weld_target)
+    target = layout.gathered(table.weld_target)
     first = np.empty(table.vertex_count, dtype=np.uint32)
     vertices = np.arange(len(target), dtype=np.uint32)
     # In repeated assignments the last one counts, so assign in reverse order.

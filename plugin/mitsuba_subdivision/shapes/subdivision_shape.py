@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 from weakref import WeakMethod
 
@@ -17,8 +18,8 @@ from ..llvm import require_llvm
 from ..surface import TEXCOORDS
 from ..variants import Variant
 from .cage_attributes import PREFIX, CageAttributes, mesh_attributes, mesh_name
-from .device_state import DeviceState, flat_type, is_recording, paused_collection, traversed
-from .mesh_buffers import MeshBuffers, require_control_points
+from .device_state import DeviceState, flat_type, is_recording, paused_collection, require_values, traversed
+from .mesh_buffers import MeshBuffers
 from .parameter_table import errors_about, plugin_page
 from .parameters import Parameters, Tessellation, read_parameters
 from .placement import Placement, checked_matrix
@@ -89,8 +90,8 @@ def make_subdivision(
                     )
             attributes = mesh_attributes(surface.cage)
             exposed = [name for name in (TEXCOORDS, *attributes) if name in surface.attribute_names]
-            values = {} if self._exact is None else self._exact.values
-            followers: dict[str, Callable] = {name: of_channel.set for name, of_channel in values.items()}
+            channels = {} if self._exact is None else self._exact.channels
+            followers: dict[str, Callable] = {name: channel.values.set for name, channel in channels.items()}
             displaces = None if self._displacement is None else self._displacement.attribute
             if self._displacement is not None:
                 followers[self._displacement.attribute] = self._displacement.set_values
@@ -132,10 +133,13 @@ def make_subdivision(
             bound = self._displacement.bound() if self._displacement is not None and is_adaptive else None
             table = self._tessellation.table(surface, control_points, to_world, bound)
             kept = None if parameters.shown is None else np.flatnonzero(parameters.shown[table.element])
-            if self._exact is None or self._has_textured_emitter:
-                attributes = surface.attribute_table(table)
-            else:
-                attributes = self._exact.welded_table(table)
+            # Exact shading evaluates texture coordinates at hits, so that their seams need no copies of vertices. Those
+            # of displaced vertices are averaged over copies along all seams.
+            names = surface.attribute_names
+            if self._exact is not None and not self._has_textured_emitter:
+                names = tuple(name for name in names if name != TEXCOORDS)
+            attributes = surface.attribute_table(table, names if self._displacement is None else None)
+            attributes = replace(attributes, values={name: attributes.values[name] for name in names})
             if self._exact is not None:
                 self._exact.set_triangles(table, kept)
             self._cage.set_triangles(attributes)
@@ -155,7 +159,7 @@ def make_subdivision(
 
         def _assemble(self, *, moves_points: bool) -> None:
             """Fill all buffers of the mesh."""
-            buffers = self._tessellate(moves_points=moves_points)
+            buffers = self._mesh.evaluated(self.control_points, moves_points=moves_points)
             # The kernels for the vertices run while the host prepares the triangles.
             dr.eval(buffers)
             self._has_turned_faces = self._placement.mirrors
@@ -172,7 +176,7 @@ def make_subdivision(
             limits the tessellation does both.
             """
             self._require_unfrozen()
-            self._require_control_points()
+            self._require_control_points(are_new=True)
             points = np.array(self.control_points, dtype=np.float64).reshape(-1, 3)
             to_world = checked_matrix(self.to_world)
             self._placement.take(self.to_world, to_world)
@@ -214,7 +218,8 @@ def make_subdivision(
                 self._tessellation = tessellation
                 self.retessellate()
                 return
-            buffers = {**self._tessellate(moves_points="control_points" in keys), **self._cage.buffers(attributes)}
+            buffers = self._mesh.evaluated(self.control_points, moves_points="control_points" in keys)
+            buffers |= self._cage.buffers(attributes)
             if self._placement.mirrors != self._has_turned_faces:
                 turned = np.array(self._get_buffers("faces")["faces"]).reshape(-1, 3)[:, [0, 2, 1]]
                 buffers["faces"] = mapped(variant.UInt32, turned) if is_jit else turned.ravel()
@@ -245,8 +250,7 @@ def make_subdivision(
             for name, values in self._get_buffers(*names).items():
                 if len(values) != self._lengths[name]:
                     raise ValueError(f'parameter "{name}": {len(values)} numbers; expected {self._lengths[name]}')
-            if "control_points" in keys:
-                self._require_control_points()
+            self._require_control_points(are_new="control_points" in keys)
             to_world = checked_matrix(self.to_world) if "to_world" in keys and not is_recording() else None
             if to_world is not None and bool(np.linalg.det(to_world[:3, :3]) < 0) != self._has_turned_faces:
                 self._require_unfrozen()
@@ -267,14 +271,10 @@ def make_subdivision(
                     "before it is called first, or load the scene anew"
                 )
 
-        def _require_control_points(self) -> None:
+        def _require_control_points(self, *, are_new: bool) -> None:
             with errors_about("control_points"):
-                require_control_points(self.control_points, self._parameters.surface.cage.vertex_count)
-
-        def _tessellate(self, *, moves_points: bool) -> dict[str, FloatBuffer]:
-            """Evaluate the moving buffers, and update exact shading."""
-            with errors_about("control_points"):
-                return self._mesh.evaluated(self.control_points, moves_points=moves_points)
+                count = self._parameters.surface.cage.vertex_count
+                require_values(self.control_points, count, 3, "control point", are_new=are_new)
 
         def renew_derivatives(
             self,

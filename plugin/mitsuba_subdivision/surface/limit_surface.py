@@ -29,7 +29,7 @@ from ..variants import variant_name
 from .arguments import checked_elements, checked_form, checked_samples, require_derivatives, require_valences
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
     from types import ModuleType
 
     from scipy import sparse
@@ -608,15 +608,15 @@ class LimitSurface:
         points, *tangents = self._matrices(*table.locations(), limit_stencils, 3)
         return VertexMatrices(points[table.weld_target], *tangents)
 
-    def attribute_table(self, table: VertexTable) -> AttributeTable:
-        """Evaluate the cage's texture coordinates and attributes at the vertices of a tessellation.
+    def attribute_table(self, table: VertexTable, names: Iterable[str] | None = None) -> AttributeTable:
+        """Evaluate the cage's texture coordinates and attributes, or those named, at the vertices of a tessellation.
 
         Raises
         ------
         SchemeError
             If the scheme has no rules for one of them.
         """
-        channels = {name: self.channel(name) for name in self.attribute_names}
+        channels = {name: self.channel(name) for name in (self.attribute_names if names is None else names)}
         return AttributeTable.build(table, self.patches, self.cage.cut_mesh.vertex, channels)
 
     def sample_vertices(
