@@ -15,11 +15,9 @@ if TYPE_CHECKING:
 
     from ..patches import PatchTable
 
-# Measured peak memory of a uniform tessellation: bytes per vertex, with its point, normal and two triangles; bytes per
-# weight of a point and two tangents; and temporary copies of the weights of the largest class.
-VERTEX_BYTES = 90
-WEIGHT_BYTES = 3 * 8
-LARGEST_CLASS_COPIES = 3
+# Measured peak memory of a uniform tessellation, in bytes: of a vertex, with its point, normal and two triangles, and of
+# a sample of a class of patches.
+VERTEX_BYTES, SAMPLE_BYTES = 90, 900
 # Peak bytes per triangle of an adaptive tessellation, with its vertices and their weights.
 ADAPTIVE_TRIANGLE_BYTES = 400
 # Bytes that are assumed to be available, because a query takes half as long as computing a small cage's weights.
@@ -32,11 +30,11 @@ def bytes_of_tessellation(patches: PatchTable, grid: UniformGrid) -> int:
     in_whole = (rate + 1) ** 2 if patches.scheme.domain.corner_count == 4 else (rate + 1) * (rate + 2) // 2
     # A patch at a corner of an element has half the segments along each side.
     at_corner = (rate // 2 + 1) ** 2
-    weights = [0]
+    sample_count = 0
     for patch_class in (patches if refined is None else refined.table).classes:
         is_whole = refined is None and patches.is_whole[patches.elements.face[patch_class.corners[:1]]][0]
-        weights.append(WEIGHT_BYTES * patch_class.controls.shape[1] * (in_whole if is_whole else at_corner))
-    return VERTEX_BYTES * grid.vertex_count + sum(weights) + LARGEST_CLASS_COPIES * max(weights)
+        sample_count += in_whole if is_whole else at_corner
+    return VERTEX_BYTES * grid.vertex_count + SAMPLE_BYTES * sample_count
 
 
 def require_memory(patches: PatchTable, grid: UniformGrid) -> None:
