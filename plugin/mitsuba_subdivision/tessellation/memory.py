@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
     from ..patches import PatchTable
 
-# Measured peak memory of a uniform tessellation, in bytes: of a vertex, with its point, normal and two triangles, and of
-# a sample of a class of patches.
+# Measured peak memory of a uniform tessellation, in bytes: of a vertex, with its point, normal and two triangles, and
+# of a sample of a class of patches.
 VERTEX_BYTES, SAMPLE_BYTES = 90, 900
 # Peak bytes per triangle of an adaptive tessellation, with its vertices and their weights.
 ADAPTIVE_TRIANGLE_BYTES = 400
