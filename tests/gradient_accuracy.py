@@ -48,9 +48,9 @@ def main() -> None:
         tables[name](options.spp, options.seeds)
 
 
-def off(found: Estimate, expected: float, random: float) -> str:
+def off(estimate: Estimate, expected: float, random: float) -> str:
     """How far an estimate is off, and the standard error of that, in parts of the value."""
-    return f"{(found.mean - expected) / abs(expected):+8.2%} +- {random / abs(expected):.2%}"
+    return f"{(estimate.mean - expected) / abs(expected):+8.2%} +- {random / abs(expected):.2%}"
 
 
 def print_inside(spp: int, seeds: int) -> None:
@@ -61,9 +61,9 @@ def print_inside(spp: int, seeds: int) -> None:
         for shading, rate in [*(("vertex", rate) for rate in RATES), ("exact", RATES[0])]:
             shape = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": rate, "shading": shading}
             pictures = Pictures(inside(material, "around", shape), *ways, spp, seeds)
-            found, difference = pictures.derivatives("reverse"), pictures.differences(STEP)
-            apart = off(found, difference.mean, (found - difference).error)
-            print(f"{material:<10} {shading:<8} {rate:4}  {found}  {difference}  {apart}", flush=True)
+            estimate, difference = pictures.derivatives("reverse"), pictures.differences(STEP)
+            apart = off(estimate, difference.mean, (estimate - difference).error)
+            print(f"{material:<10} {shading:<8} {rate:4}  {estimate}  {difference}  {apart}", flush=True)
 
 
 def print_outlines(spp: int, seeds: int) -> None:
@@ -77,10 +77,10 @@ def print_outlines(spp: int, seeds: int) -> None:
             estimates = []
             for emits, more in ((False, {}), (True, {"face_normals": True}), (True, {})):
                 scene = outline(outlines.properties(surface, rate, **more), emits=emits)
-                found = along(gradients(scene, POINTS, spp, seeds), positions)
-                estimates.append(found if emits else Estimate(-found.values))
+                estimate = along(gradients(scene, POINTS, spp, seeds), positions)
+                estimates.append(estimate if emits else Estimate(-estimate.values))
             pictures = Pictures(scene, {POINTS: positions}, {POINTS: positions}, 4 * spp, seeds)
-            texts = "   ".join(off(found, expected, found.error) for found in estimates)
+            texts = "   ".join(off(estimate, expected, estimate.error) for estimate in estimates)
             print(f"{name:<24} {rate:3}  {expected:.5f}  {texts}   {pictures.differences(GROWTH)}", flush=True)
 
 
@@ -91,11 +91,11 @@ def print_triangles(_spp: int, _seeds: int) -> None:
         surface = build()
         directions = list(motions(surface).values())
         area = surface.stiffness(solids.STIFFNESS_ORDER) @ surface.cage.positions
-        areas = [(area * each).sum() for each in directions]
+        areas = [(area * direction).sum() for direction in directions]
         exact = np.column_stack([areas, solids.derivatives_of_surface(surface, directions)])
         for rate in INTEGRAL_RATES:
-            _, found = solids.derivatives_of(surface, directions, rate, types)
-            parts = zip(*(np.split(each, [1, 2, 5], axis=1) for each in (found - exact, exact)), strict=True)
+            _, of_triangles = solids.derivatives_of(surface, directions, rate, types)
+            parts = zip(*(np.split(values, [1, 2, 5], axis=1) for values in (of_triangles - exact, exact)), strict=True)
             errors = (np.linalg.norm(error) / np.linalg.norm(value) for error, value in parts)
             print(f"{name:<14} {rate:5}  " + "  ".join(f"{error:8.1e}" for error in errors), flush=True)
 

@@ -46,7 +46,7 @@ def main() -> None:
         for rate in options.rates:
             for shading in ("vertex", "exact"):
                 normal, radiance, elsewhere = differences(hits(name, rate, shading, options.resolution), reference)
-                numbers = [np.quantile(each, share) for each in (normal, radiance) for share in (0.5, 0.99)]
+                numbers = [np.quantile(errors, share) for errors in (normal, radiance) for share in (0.5, 0.99)]
                 print(f"{name:<9} {rate:4}  {shading:<8}" + "          {:8.1e}  {:8.1e}".format(*numbers[:2]), end="")
                 print("             {:8.1e}  {:8.1e}     {:7.2%}".format(*numbers[2:], elsewhere), flush=True)
 
@@ -62,18 +62,18 @@ def hits(name: str, rate: int, shading: str, resolution: int) -> dict[str, np.nd
     ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, mi.Point2f(x, y), mi.Point2f(0.5))
     si = scene.ray_intersect(ray)
     box = scene.bbox()
-    found = {"p": si.p, "n": si.sh_frame.n, "d": ray.d, "hit": si.is_valid(), "size": box.max - box.min}
-    return {key: np.array(value).T for key, value in found.items()}
+    values = {"p": si.p, "n": si.sh_frame.n, "d": ray.d, "hit": si.is_valid(), "size": box.max - box.min}
+    return {key: np.array(value).T for key, value in values.items()}
 
 
-def differences(found: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, float]:
+def differences(seen: dict[str, np.ndarray], reference: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, float]:
     """Differences of normals and of mirrored radiance, where both rays hit the same place, and the share of others."""
     # On the surface or the triangle, both are on the ray.
-    apart = np.linalg.norm(found["p"] - reference["p"], axis=1)
-    same = found["hit"] & reference["hit"] & (apart < SAME_PLACE * np.abs(reference["size"]).max())
-    one, other = (each["n"][same] for each in (found, reference))
+    apart = np.linalg.norm(seen["p"] - reference["p"], axis=1)
+    same = seen["hit"] & reference["hit"] & (apart < SAME_PLACE * np.abs(reference["size"]).max())
+    one, other = (values["n"][same] for values in (seen, reference))
     radiance = [sky(mirrored(reference["d"][same], n)) for n in (one, other)]
-    elsewhere = 1 - np.count_nonzero(same) / np.count_nonzero(found["hit"] | reference["hit"])
+    elsewhere = 1 - np.count_nonzero(same) / np.count_nonzero(seen["hit"] | reference["hit"])
     return np.linalg.norm(one - other, axis=1), np.abs(radiance[0] - radiance[1]), elsewhere
 
 

@@ -167,8 +167,8 @@ def test_a_torus_grid_is_a_bicubic_spline(np_rng):
     assert (samples.level == 0).all()
 
 
-@pytest.mark.parametrize("distance", [1e3, 1e6])
-def test_translation_changes_normals_by_no_more_than_rounding_the_cage_does(exact, distance):
+def test_translation_changes_normals_by_no_more_than_rounding_the_cage_does(exact):
+    distance = 1e6
     shift = distance * np.array([0.6, -0.48, 0.64])
     moved = exact.cage.with_positions(exact.cage.positions + shift)
     # What rounding alone does: the moved cage, moved back exactly.

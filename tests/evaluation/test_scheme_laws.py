@@ -172,7 +172,7 @@ SHARPENED.phantom_points = None
 
 class OtherBorder(CatmullClark):
     name = "other_border"
-    phantom_points = tuple(PhantomPoint(each.offsets, (1.9, -0.9)) for each in CatmullClark.phantom_points)
+    phantom_points = tuple(PhantomPoint(point.offsets, (1.9, -0.9)) for point in CatmullClark.phantom_points)
 
 
 @pytest.mark.parametrize(

@@ -210,8 +210,8 @@ def test_descents_end_at_local_minima_and_depend_on_neither_the_unit_nor_other_p
     np.testing.assert_array_equal(nearest_in_pieces(scaled, which, unit * points, begin, unit)[0], uv)
     # Some take shorter steps where others have taken theirs.
     parts = [nearest_in_pieces(pieces, which[at], points[at], begin[at], 1.0) for at in np.split(np.arange(count), 100)]
-    np.testing.assert_allclose(uv, np.concatenate([each for each, _, _ in parts]), rtol=0, atol=DESCENT)
-    np.testing.assert_allclose(slope, np.concatenate([each for _, _, each in parts]), rtol=0, atol=DESCENT)
+    np.testing.assert_allclose(uv, np.concatenate([places for places, _, _ in parts]), rtol=0, atol=DESCENT)
+    np.testing.assert_allclose(slope, np.concatenate([slopes for _, _, slopes in parts]), rtol=0, atol=DESCENT)
 
 
 def test_holes_have_no_nearest_points():

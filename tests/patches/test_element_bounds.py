@@ -92,7 +92,7 @@ def test_boxes_are_the_same_from_the_cage_refined_once(np_rng, monkeypatch):
     assert refined.patches.refined is not None
     assert_contained(refined, np_rng)
     monkeypatch.undo()
-    boxes, expected = ([each.lower, each.upper] for each in (refined.bounds(), LimitSurface(cage).bounds()))
+    boxes, expected = ([bounds.lower, bounds.upper] for bounds in (refined.bounds(), LimitSurface(cage).bounds()))
     size = np.linalg.norm(expected[1] - expected[0], axis=1).max()
     # Parts around extraordinary points are bounded otherwise.
     np.testing.assert_allclose(boxes, expected, rtol=0, atol=0.03 * size)

@@ -58,7 +58,7 @@ def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkey
     np.testing.assert_array_equal(table.controls, refined.table.controls)
     assert surface.sampling(1).refinement is table.refinement
     # The patch at a half-edge is the refined face there.
-    corners = np.concatenate([each.corners for each in refined.table.classes])
+    corners = np.concatenate([group.corners for group in refined.table.classes])
     for half_edge, code in enumerate(table.half_edges[:, layout.CODE]):
         assert corners[code // layout.PATCH] == refined.table.topology.face_offsets[half_edge]
 

@@ -10,7 +10,7 @@ from mitsuba_subdivision.cage import named_cages
 
 
 @pytest.mark.core
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda each: pickle.loads(pickle.dumps(each))])
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda value: pickle.loads(pickle.dumps(value))])
 @pytest.mark.parametrize("scheme", ["catmull_clark", "doo_sabin"])
 def test_copies_of_used_surfaces_are_the_same_surfaces(copied, scheme):
     surface = LimitSurface(named_cages.cube(), scheme)

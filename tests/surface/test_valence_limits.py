@@ -121,7 +121,7 @@ def test_far_faces_of_a_fan_do_not_matter(scheme, whole, corner, np_rng, monkeyp
     element = np.array([0, NEAR_FACES // 2, count - 3])
     for level in (1, FEW_LEVELS, 45):
         uv = np.tile([0.6, 0.31], (len(element), 1)) * 2.0**-level
-        near, expected = (LimitSurface(cage, each).evaluate(element, uv) for each in (scheme, whole))
+        near, expected = (LimitSurface(cage, rules).evaluate(element, uv) for rules in (scheme, whole))
         np.testing.assert_allclose(near.p, expected.p, rtol=0, atol=ROUNDED_POINT)
         np.testing.assert_allclose(near.n, expected.n, rtol=0, atol=ROUNDED_NORMAL)
         if level <= FEW_LEVELS:
@@ -129,6 +129,6 @@ def test_far_faces_of_a_fan_do_not_matter(scheme, whole, corner, np_rng, monkeyp
             np.testing.assert_allclose(near.p, by_rules.p, rtol=0, atol=ROUNDED_POINT)
             np.testing.assert_allclose(near.n, by_rules.n, rtol=0, atol=ROUNDED_NORMAL)
     # The limit at the vertex depends on no other faces than those on the border.
-    near, expected = (LimitSurface(cage, each).evaluate(element, [[0, 0]]) for each in (scheme, whole))
+    near, expected = (LimitSurface(cage, rules).evaluate(element, [[0, 0]]) for rules in (scheme, whole))
     np.testing.assert_allclose(near.p, expected.p, rtol=0, atol=ROUNDED_POINT)
     assert (near.n[:, 2] > 0).all()

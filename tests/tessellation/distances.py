@@ -23,7 +23,7 @@ def distances(surface, table, most_triangles=6000, most_points=120, seed=0):
     elements = surface.patches.elements
     element = elements.face[half_edge[own]].astype(np.int64)
     corner = half_edge[own] - elements.face_offsets[element]
-    element, corner = (np.repeat(each, len(PLACES)) for each in (element, corner))
+    element, corner = (np.repeat(numbers, len(PLACES)) for numbers in (element, corner))
     on_surface = surface.evaluate(element, np.clip((PLACES @ uv[own]).reshape(-1, 2), 0, 1), corner).p
     apart = np.linalg.norm(on_triangles - on_surface, axis=1)
     from_own = distances_of_pairs(on_surface, np.repeat(corners[own], len(PLACES), axis=0))

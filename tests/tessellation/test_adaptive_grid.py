@@ -188,8 +188,8 @@ def test_any_cage_has_an_adaptive_tessellation(seed):
     table = table_of(surface, (1, 0.1, 0.01)[seed % 3], 1 + seed % 8)
     assert_elements_are_covered(surface, table)
     assert_vertices_lie_where_triangles_say(surface, table)
-    (_, keys, twins), (_, uniform_keys, _) = (numbered_edges(each.triangles) for each in (table, surface.sampling(3)))
-    is_unique, is_expected = (len(np.unique(each)) == len(each) for each in (keys, uniform_keys))
+    (_, keys, twins), (_, uniform_keys, _) = (numbered_edges(mesh.triangles) for mesh in (table, surface.sampling(3)))
+    is_unique, is_expected = (len(np.unique(edges)) == len(edges) for edges in (keys, uniform_keys))
     assert is_unique or not is_expected
     if (surface.patches.elements.twin >= 0).all():
         np.testing.assert_array_equal(np.sort(keys), np.sort(twins))

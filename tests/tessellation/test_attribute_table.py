@@ -60,7 +60,7 @@ EVERY_GRID = pytest.mark.parametrize(("scheme", "cage", "rate"), GRIDS.values(),
 def test_every_vertex_has_the_values_of_its_element_at_its_place(scheme, cage, rate, mode, np_rng):
     """And positions and normals do not change by a bit."""
     surface = LimitSurface(with_seams(bumpy(cage), np_rng, mode), scheme)
-    mesh, plain = (each.tessellate(rate) for each in (surface, LimitSurface(without_attributes(surface.cage), scheme)))
+    mesh, plain = surface.tessellate(rate), LimitSurface(without_attributes(surface.cage), scheme).tessellate(rate)
     assert len(mesh.normals) == len(mesh.texcoords) == len(mesh.positions) > len(plain.positions)
     np.testing.assert_array_equal(mesh.positions[mesh.triangles], plain.positions[plain.triangles])
     np.testing.assert_array_equal(mesh.normals[mesh.triangles], plain.normals[plain.triangles])

@@ -102,7 +102,7 @@ def test_least_product_is_the_least(np_rng):
     """Of all integers up to 60, tried one by one."""
     forms = 10 ** np_rng.uniform(-2, 1.5, (3, 3, 400))
     products = least_product(forms)
-    n, m = (each.ravel() for each in np.indices((60, 60)) + 1)
+    n, m = (index.ravel() for index in np.indices((60, 60)) + 1)
     a, b, c = forms[:, :, :, None].swapaxes(0, 1)
     holds = ((a / n**2 + 2 * b / (n * m) + c / m**2) <= 1).all(axis=0)
     assert holds[np.arange(len(products)), (products[:, 0] - 1) * 60 + products[:, 1] - 1].all()
@@ -194,7 +194,7 @@ def test_a_tangent_that_nearly_vanishes_leaves_the_whole_difference_as_the_bound
     """At a curve in place of a surface, however much of the other tangent rounding leaves; in single precision."""
     u, _ = (BICUBIC.indices / 3).T
     points = np.stack([u, 0 * u, u**3], axis=1)[..., None].astype(np.float32)
-    derivatives = [each.astype(np.float32) for each in derivatives_of(points)]
+    derivatives = [derivative.astype(np.float32) for derivative in derivatives_of(points)]
     derivatives[1][:] = np.float32(scale) * np.array([0, 0, 1])[:, None]
     form = Criterion(Measure.CHORD, 1.0).form(points, derivatives, 4)
     whole = np.sqrt(np.square(derivatives[2]).sum(axis=1).max(axis=0))
@@ -247,7 +247,7 @@ def test_only_outlines_are_fine_where_only_they_are_asked_for():
     sides = np.sign(np.einsum("ij,ij->i", normals, points - SENSOR.eye))[fine.triangles]
     # Elements with an outline are no coarser than where all are fine.
     elements = np.unique(fine.element[np.ptp(sides, axis=1) > 0])
-    coarse, dense = (np.bincount(each.element, minlength=TORUS.cage.face_count) for each in (at_outline, fine))
+    coarse, dense = (np.bincount(table.element, minlength=TORUS.cage.face_count) for table in (at_outline, fine))
     assert 0 < len(elements) < TORUS.cage.face_count
     assert (coarse[elements] > 0.2 * dense[elements]).all()
 

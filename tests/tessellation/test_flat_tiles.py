@@ -38,17 +38,17 @@ def tiles_of(surface, scheme, side=None):
     patches, points = surface.patches, surface.cage.positions[surface.cage.cut_mesh.vertex]
     if patches.refined is not None:
         patches, points = patches.refined.table, patches.refined.matrix @ points
-    u, v = (each.ravel() / SAMPLES for each in np.indices((SAMPLES + 1,) * 2))
+    u, v = (index.ravel() / SAMPLES for index in np.indices((SAMPLES + 1,) * 2))
     uv = np.stack([u, v], axis=1)[scheme.domain.inside(np.stack([u, v], axis=1)) >= 0]
     if side is not None:
         begin, end = scheme.domain.corners[side], scheme.domain.corners[(side + 1) % scheme.domain.corner_count]
         uv = begin + np.linspace(0, 1, 4 * SAMPLES)[:, None] * (end - begin)
-    elements = patch_trees(scheme, [each.signature for each in patches.classes])
-    for each, element in zip(patches.classes, elements, strict=True):
+    elements = patch_trees(scheme, [group.signature for group in patches.classes])
+    for group, element in zip(patches.classes, elements, strict=True):
         tile, rows = part_of_tile(element, np.eye(element.control_count))
         if not tile.is_piece:
-            values = points[each.controls]
-            samples = np.tensordot(element_stencils(scheme, each.signature, uv)[0], values, axes=(1, 1))
+            values = points[group.controls]
+            samples = np.tensordot(element_stencils(scheme, group.signature, uv)[0], values, axes=(1, 1))
             yield tile, np.einsum("kj,tjd->kdt", rows, values), samples
 
 
@@ -63,7 +63,7 @@ def extents(tile, values, axes):
 def assert_tight(extent, axes, samples, loose=LOOSE):
     """Whether extents along axes, of tiles of several groups, are those of their samples."""
     extent = np.concatenate(extent)
-    size, whole = (np.concatenate([sizes(each, along) for each in samples]) for along in (axes, np.eye(3)))
+    size, whole = (np.concatenate([sizes(group, along) for group in samples]) for along in (axes, np.eye(3)))
     assert (extent >= (1 - MISSED) * size - ROUNDING).all()
     is_tight = extent - size <= loose * np.linalg.norm(axes) * whole
     assert np.mean(is_tight[np.isfinite(extent)]) > MOST
@@ -105,7 +105,7 @@ def test_sides_are_hardly_smaller_than_their_hulls(name, np_rng):
         groups = list(tiles_of(surface, surface.scheme, side))
         hulls = [np.einsum("hk,kdt,d->ht", tile.side_hulls[side], values, axes[0]) for tile, values, _ in groups]
         if groups:
-            assert_tight([np.ptp(each, axis=0) for each in hulls], axes, [samples for *_, samples in groups])
+            assert_tight([np.ptp(hull, axis=0) for hull in hulls], axes, [samples for *_, samples in groups])
 
 
 class Raised(CatmullClark):

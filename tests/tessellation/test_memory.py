@@ -138,7 +138,7 @@ OF_ANOTHER_CAGE = (np.zeros((5, 3)), np.zeros((9, 3)), np.full((8, 3), np.nan))
     [
         (LimitSurface.tessellate, (2.5, "8", None, np.array([1, 2])), "tessellation rate .*; expected an integer"),
         (LimitSurface.tessellate, (0, -1), "tessellation rate (0|-1); expected 1 or more"),
-        (lambda each, rate: uniform_table(each.patches, rate), (0, -1), "tessellation rate (0|-1); expected 1 or more"),
+        (lambda s, rate: uniform_table(s.patches, rate), (0, -1), "tessellation rate (0|-1); expected 1 or more"),
         (
             lambda surface, rate: surface.adaptive_sampling(CHORD, rate),
             MAX_RATES,
