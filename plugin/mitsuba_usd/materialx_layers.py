@@ -96,20 +96,21 @@ def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
         return None
     document = MaterialX.createDocument()
     document.setDataLibrary(library())
+    layer = Sdf.Layer.CreateAnonymous("materialx.usda")
+    stage = Usd.Stage.Open(layer)
+    stage.SetDefaultPrim(stage.DefinePrim("/MaterialX"))
+    stage.DefinePrim("/MaterialX/Materials")
     try:
         with Ar.GetResolver().OpenAsset(resolved) as asset:
             text = bytes(asset.GetBuffer()).decode()
         search = MaterialX.FileSearchPath(str(Path(str(resolved)).parent))
         MaterialX.readFromXmlString(document, text, search)
-    except (MaterialX.ExceptionParseError, MaterialX.Exception, OSError, UnicodeError) as error:
+        for node in document.getMaterialNodes():
+            _Material(stage, node, str(resolved))
+    # Nodes that are built of themselves cause the last one.
+    except (MaterialX.ExceptionParseError, MaterialX.Exception, OSError, UnicodeError, RecursionError) as error:
         warn(f"{name}: the MaterialX document {path} cannot be read ({str(error).strip()}); its materials are ignored")
         return None
-    layer = Sdf.Layer.CreateAnonymous("materialx.usda")
-    stage = Usd.Stage.Open(layer)
-    stage.SetDefaultPrim(stage.DefinePrim("/MaterialX"))
-    stage.DefinePrim("/MaterialX/Materials")
-    for node in document.getMaterialNodes():
-        _Material(stage, node, str(resolved))
     return layer
 
 

@@ -301,9 +301,13 @@ POSITIONS = element("position", "p", "vector3")
 POSITIONS += element("convert", "c", "color3", given("in", "vector3", nodename="p"))
 
 
+BODY = '<multiply name="m" type="float"><input name="in1" type="float" interfacename="in" />'
+ENDLESS = DOUBLE.replace(BODY, BODY.replace("multiply", "double").replace("in1", "in"))
+ENDLESS = ENDLESS.replace('<input name="in2" type="float" value="2" /></multiply>', "</double>")
 THIN_FILM = given("thin_film_thickness", "float", value="500")
 TOLD = [
     ("<materialx", "cannot be read"),
+    (document(*TWICE, graph=ENDLESS), "cannot be read (maximum recursion depth"),
     (document(given("subsurface", "float", value="1")), "subsurface scattering is rendered as diffuse"),
     (document(THIN_FILM), "inputs of standard_surface that Mitsuba's BSDFs lack"),
     (document(given("base_color", "color3", nodename="c"), graph=POSITIONS), 'nodes "position" are ignored'),
