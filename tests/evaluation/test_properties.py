@@ -1,7 +1,6 @@
 """Laws of evaluation on random closed cages."""
 
 import numpy as np
-import pytest
 from evaluation.common import EVERY_SCHEME, evaluate_from
 from evaluation.random_cages import cages
 from hypothesis import given, settings
@@ -76,39 +75,3 @@ def test_the_order_of_vertices_faces_and_corners_does_not_matter(scheme, data, s
     assert_equal_derivatives(renumbered.dp_du, expected.dp_du)
     assert_equal_derivatives(renumbered.dp_dv, expected.dp_dv)
     assert angle(renumbered.n, expected.n).max() <= NORMAL
-
-
-def along_edge(surface, half_edge, t):
-    """Corner and parameters at ``t`` along the element edge that begins at a corner."""
-    elements = surface.patches.elements
-    whole = surface.patches.is_whole[elements.face[half_edge]]
-    first_half = whole | (t < 0.5)
-    corner = np.where(first_half, half_edge, elements.next[half_edge])
-    u, v = np.where(first_half, np.where(whole, t, 2 * t), 0), np.where(first_half, 0, 2 - 2 * t)
-    return corner, np.stack([u, v], axis=1)
-
-
-def assert_agree(surface, one, other):
-    one, other = evaluate_from(surface, *one), evaluate_from(surface, *other)
-    assert np.abs(one.p - other.p).max() <= POINT
-    assert angle(one.n, other.n).max() <= NORMAL
-
-
-@pytest.mark.core
-@of_random_cages
-def test_elements_and_their_sub_patches_agree_where_they_meet(scheme, data, seed):
-    cage, rng = data.draw(cages(scheme)), np.random.default_rng(seed)
-    surface = LimitSurface(cage, scheme)
-    elements = surface.patches.elements
-    half_edge = rng.integers(0, elements.half_edge_count, SAMPLES)
-    # The other side is counted from the other end: few bits, so that both have the same point.
-    t = rng.integers(1, 2**20, SAMPLES) / 2**20
-    assert_agree(surface, along_edge(surface, half_edge, t), along_edge(surface, elements.twin[half_edge], 1 - t))
-    # All limits at a corner are those of the first half-edge there.
-    _, first, number = np.unique(elements.face_vertices, return_index=True, return_inverse=True)
-    at_corner = np.zeros((elements.half_edge_count, 2))
-    assert_agree(surface, (np.arange(elements.half_edge_count), at_corner), (first[number], at_corner))
-    partial = np.flatnonzero(~surface.patches.is_whole[elements.face])
-    if len(partial):
-        half_edge, t = rng.choice(partial, SAMPLES), np.stack([np.ones(SAMPLES), rng.random(SAMPLES)], axis=1)
-        assert_agree(surface, (half_edge, t), (elements.next[half_edge], t[:, ::-1]))
