@@ -182,9 +182,7 @@ def _split_vertices(
         is_divided = np.isin(closed_fans, fan_labels(t)[0][is_border])
         begins = np.concatenate([begins, closed_fans[~is_divided]])
     begins = begins[np.argsort(t.face_vertices[begins], kind="stable")]
-    is_later = np.zeros(len(begins), dtype=bool)
-    is_later[1:] = np.diff(t.face_vertices[begins]) == 0
-    copied = begins[is_later]
+    copied = begins[np.diff(t.face_vertices[begins], prepend=-1) == 0]
     vertex = np.concatenate([np.arange(t.vertex_count), t.face_vertices[copied]])
     face_vertices = t.face_vertices.copy()
     # Walk through all sides except the first ones simultaneously, face by face.

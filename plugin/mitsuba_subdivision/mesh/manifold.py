@@ -197,8 +197,7 @@ def turning_order(topology: Topology) -> IntArray | None:
     first, second = np.sort(np.stack([t.face[one], t.face[other]]), axis=0).astype(np.int32)
     order = np.lexsort((disagrees, second, first))
     first, second, disagrees = first[order], second[order], disagrees[order]
-    is_new = np.ones(len(order), dtype=bool)
-    is_new[1:] = (np.diff(first) != 0) | (np.diff(second) != 0)
+    is_new = (np.diff(first, prepend=-1) != 0) | (np.diff(second, prepend=-1) != 0)
     count = t.face_count
     costs = (1 + disagrees[is_new], (first[is_new], second[is_new]))
     tree = minimum_spanning_tree(sparse.coo_array(costs, shape=(count, count))).tocoo()

@@ -65,8 +65,7 @@ def _polynomials(patches: PatchTable, grid: AdaptiveGrid) -> tuple[VertexPolynom
     # Face h of the cage refined once lies at half-edge h of the cage, and begins there.
     patch_class, patch, _ = table.patch_at(corner if refined is None else table.topology.face_offsets[corner])
     order = np.lexsort((*uv, patch_class))
-    is_new = np.ones(len(order), dtype=bool)
-    is_new[1:] = (np.diff(uv[:, order]) != 0).any(axis=0) | (np.diff(patch_class[order]) != 0)
+    is_new = (np.diff(uv[:, order], prepend=-1) != 0).any(axis=0) | (np.diff(patch_class[order], prepend=-1) != 0)
     distinct = order[is_new]
     counts = np.bincount(patch_class[distinct], minlength=len(table.classes))
     uv_of_class = np.split(np.ascontiguousarray(uv[:, distinct].T), np.cumsum(counts)[:-1])
