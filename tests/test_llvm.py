@@ -19,13 +19,12 @@ NEEDS_LLVM = pytest.mark.skipif(llvm.llvm_problem() is not None, reason="no usab
 
 # Runs before the package, which chooses on import: hides the Python environment's libraries, sets the system's folder.
 HIDE = """
-import importlib.metadata, importlib.util, os, site, sys
+import importlib.util, os, site, sys
 folder = os.path.dirname(importlib.util.find_spec("mitsuba_subdivision").origin)
 spec = importlib.util.spec_from_file_location("mitsuba_subdivision.llvm", folder + "/llvm.py")
 llvm = sys.modules[spec.name] = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(llvm)
 llvm._python_folders = lambda: []
-llvm._wheel_libraries = lambda: []
 llvm._SYSTEM_FOLDERS = (os.environ["SYSTEM_FOLDER"],)
 """
 
@@ -52,7 +51,6 @@ def fresh(monkeypatch, tmp_path):
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setattr(llvm.platform, "machine", lambda: "x86_64")
     monkeypatch.setattr(llvm, "_python_folders", lambda: [str(python)])
-    monkeypatch.setattr(llvm, "_wheel_libraries", list)
     monkeypatch.setattr(llvm, "_SYSTEM_FOLDERS", (str(system),))
     llvm.select_llvm.cache_clear()
     yield python, system
@@ -85,23 +83,16 @@ def test_version_by_the_name_behind_links(tmp_path):
     assert llvm.library_version(tmp_path / "libLLVM.so") == 19
 
 
-def test_libraries_of_the_wheel_are_found_wherever_they_lie(monkeypatch, tmp_path):
-    record = tmp_path / "site/karellen_llvm_core-19.1.0.dist-info"
-    record.mkdir(parents=True)
-    (record / "METADATA").write_text("Metadata-Version: 2.1\nName: karellen-llvm-core\nVersion: 19.1.0\n")
-    (record / "RECORD").write_text("../elsewhere/libLLVM.so.19.1,,\n../elsewhere/libLLVM.so.18.1,,\nllvm.txt,,\n")
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "elsewhere/libLLVM.so.19.1").touch()
-    monkeypatch.setattr(sys, "path", [str(tmp_path / "site")])
-    assert llvm._wheel_libraries() == [str(tmp_path / "elsewhere/libLLVM.so.19.1")]
-
-
-def test_without_the_wheel_nothing_is_imported_to_look_for_it(fresh):
-    hide = HIDE.replace("import importlib.metadata, ", "import ")
-    hide = hide.replace("llvm._wheel_libraries = lambda: []", "llvm._WHEEL = 'no-such-wheel'")
-    code = f"import sys; sys.modules['importlib.metadata'] = None\n{hide}llvm.select_llvm()"
-    done = run(code, SYSTEM_FOLDER=str(fresh[1]))
-    assert done.returncode == 0, done.stderr
+@pytest.mark.parametrize(
+    ("modules", "libraries"), [("lib/python3.11/site-packages", "lib"), ("packages", "packages/lib")]
+)
+def test_libraries_of_a_wheel_are_found_where_its_packages_are(monkeypatch, tmp_path, modules, libraries):
+    """In an environment, and in a folder that `pip install --target` names."""
+    for folder in (modules, libraries):
+        (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+    (tmp_path / libraries / "libLLVM.so.19.1").touch()
+    monkeypatch.setattr(sys, "path", ["", str(tmp_path / modules)])
+    assert str(tmp_path / libraries / "libLLVM.so.19.1") in llvm._libraries(llvm._python_folders())
 
 
 def test_a_folder_with_a_star_stands_for_all_whose_names_begin_so(tmp_path):

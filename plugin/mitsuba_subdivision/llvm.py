@@ -32,7 +32,6 @@ INSTALL_HINT = (
 NO_USABLE_LLVM = "no LLVM library that Dr.Jit runs without aborting; see mitsuba_subdivision.llvm"
 
 _TOO_LATE = "Dr.Jit was imported first"
-_WHEEL = "karellen-llvm-core"
 _SYSTEM_FOLDERS = (
     "/usr/local/lib",
     "/usr/lib/x86_64-linux-gnu",
@@ -155,14 +154,13 @@ def best_variant() -> str:
 
 
 def _search() -> LlvmChoice:
-    """Newest usable library of the first location that has one: the Python environment, the wheel, the system."""
+    """Newest usable library of the first location that has one: the Python environment, the system."""
     newest_old, loader_folders = 0, map(glob.escape, filter(None, os.environ.get("LD_LIBRARY_PATH", "").split(":")))
-    for reason, libraries in (
-        ("found in the Python environment", lambda: _libraries(_python_folders())),
-        (f"found through {_WHEEL}", _wheel_libraries),
-        ("newest of the system", lambda: _libraries([*loader_folders, *_SYSTEM_FOLDERS])),
+    for reason, folders in (
+        ("found in the Python environment", _python_folders()),
+        ("newest of the system", [*loader_folders, *_SYSTEM_FOLDERS]),
     ):
-        versions = [(_known_version(path), path) for path in libraries()]
+        versions = [(_known_version(path), path) for path in _libraries(folders)]
         usable = [(version, path) for version, path in versions if version >= lowest_version()]
         if usable:
             version, path = max(usable)
@@ -196,23 +194,9 @@ def _libraries(folders: Iterable[str]) -> list[str]:
     return [path for path in paths if os.path.isfile(path)]
 
 
-def _wheel_libraries() -> list[str]:
-    """LLVM libraries among all files of the wheel; slower than a search of the usual folders."""
-    # What reads the wheel's list of files takes a third as long to import as Mitsuba.
-    installed = _WHEEL.replace("-", "_")
-    if not any(glob.glob(f"{glob.escape(folder)}/{installed}-*") for folder in sys.path):
-        return []
-
-    import importlib.metadata
-
-    try:
-        files = importlib.metadata.distribution(_WHEEL).files or []
-    except importlib.metadata.PackageNotFoundError:
-        return []
-    paths = [file.locate() for file in files if re.match(r"libLLVM[-.].*so", file.name)]
-    return [os.path.normpath(path) for path in paths if os.path.isfile(path)]
-
-
 def _python_folders() -> list[str]:
-    prefixes = dict.fromkeys([sys.prefix, sys.base_prefix, site.getuserbase()])
-    return [f"{glob.escape(prefix)}/lib" for prefix in prefixes]
+    """Folders of libraries of the Python environment, and of packages that were installed into another folder."""
+    prefixes = [sys.prefix, sys.base_prefix, site.getuserbase(), *filter(None, sys.path)]
+    # A wheel puts libraries two folders above its modules, or where modules are all alone below them.
+    above = [os.path.dirname(os.path.dirname(folder)) for folder in sys.path if folder.endswith("-packages")]
+    return [glob.escape(folder) for folder in dict.fromkeys([*(f"{prefix}/lib" for prefix in prefixes), *above])]
