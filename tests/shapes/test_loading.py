@@ -16,7 +16,7 @@ from mitsuba_subdivision.files.formats import FORMATS
 from mitsuba_subdivision.shapes import registration, subdivision_shape
 from mitsuba_subdivision.shapes.device_state import paused_collection
 from reference.refined_cages import tagged
-from shapes.cages import cube, described, with_attributes
+from shapes.cages import RING, cube, described
 from shapes.updates import update
 from shapes.variants import every_array_variant, every_variant, exact, exact_llvm, llvm, scalar, shadings
 
@@ -41,7 +41,7 @@ def coloured(cage, seed=0, **attributes):
 
 def of(cage, **parameters):
     rate = {} if "tessellation" in parameters else {"tessellation_rate": 2}
-    return described(cage, **rate, **parameters)
+    return described(cage, **{**rate, **parameters})
 
 
 def made(cage, **parameters):
@@ -208,49 +208,57 @@ def test_shapes_of_equal_topology_share_all_but_positions(shading, rate, tmp_pat
 
 @every_variant
 @pytest.mark.parametrize(
-    "change",
+    ("tags", "parameters"),
     [
-        {"creases": [(0, 1, 3.0)]},
-        {"creases": [(0, 1, 10.0)]},
-        {"corners": [(0, 2.0)]},
-        {"holes": [2]},
-        {"boundary": "edge_only"},
-        {"triangle_rule": "smooth"},
-        {"crease_method": "chaikin"},
-        {"face_varying": "all"},
+        ({"creases": [(0, 1, 3.0)]}, {}),
+        ({"creases": [(0, 1, 10.0)]}, {}),
+        ({"corners": [(0, 2.0)]}, {}),
+        ({"holes": [2]}, {}),
+        ({"boundary": "edge_only"}, {}),
+        ({"triangle_rule": "smooth"}, {}),
+        ({"crease_method": "chaikin"}, {}),
+        ({"face_varying": "all"}, {}),
+        ({}, {"scheme": "doo_sabin"}),
+        ({}, {"tessellation_rate": 3}),
     ],
     ids=str,
 )
-def test_shapes_of_other_tags_or_rules_share_no_patches(change):
-    one, two = (made(cage) for cage in (cube(), cube(**change)))
-    assert one._parameters.surface.patches is not two._parameters.surface.patches
+def test_shapes_of_other_tags_rules_or_schemes_share_no_patches_and_those_of_another_rate_only_these(tags, parameters):
+    one, two = made(cube()), made(cube(**tags), **parameters)
     assert one._mesh.table is not two._mesh.table
+    share = one._parameters.surface.patches is two._parameters.surface.patches
+    assert share == ("tessellation_rate" in parameters)
 
 
 @every_variant
-def test_shapes_of_another_rate_or_scheme_share_no_tessellation():
-    options = {}, {"tessellation_rate": 3}, {"scheme": "doo_sabin"}
-    shapes = [mi.load_dict({**of(cube()), **option}) for option in options]
-    assert len({id(shape._mesh.table) for shape in shapes}) == 3
-    patches = [shape._parameters.surface.patches for shape in shapes]
-    assert patches[0] is patches[1] is not patches[2]
-
-
-@every_array_variant
 @shadings
-def test_shapes_of_equal_cages_share_their_vertices_until_control_points_of_one_move(shading):
-    cage = cube(creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10)])
-    one, two = (mi.traverse(made(cage, shading=shading)) for _ in range(2))
-    assert one["vertex_positions"].index == two["vertex_positions"].index
+def test_shapes_of_equal_cages_share_arrays_until_those_of_one_change(shading):
+    points, is_jit = cube().positions, dr.is_jit_v(mi.Float)
+    cage = cube(creases=RING, texcoords=points[:, :2], attributes={"colour": points})
+    given = cage, cage, cage.with_positions(-cage.positions)
+    one, two, moved = (mi.traverse(made(cage, shading=shading)) for cage in given)
     # Normals, or what they come from.
-    other = "shading_coefficients" if shading == "exact" else "vertex_normals"
-    assert one[other].index == two[other].index
-    before = {name: np.array(two[name]) for name in ("vertex_positions", other)}
-    update(one, control_points=one["control_points"] * 2, to_world=mi.ScalarTransform4f().scale(3))
-    np.testing.assert_allclose(np.array(one["vertex_positions"]), 6 * before["vertex_positions"], rtol=SINGLE)
-    dr.scatter(two["vertex_positions"], 7.0, dr.uint32_array_t(type(two["vertex_positions"]))(0))
-    for name, values in before.items():
-        np.testing.assert_array_equal(np.array(mi.traverse(made(cage, shading=shading))[name]), values)
+    placed = ("vertex_positions", "shading_coefficients" if shading == "exact" else "vertex_normals")
+    values = ("vertex_colour", "cage_colour", "cage_texcoords")
+    for name in (*placed, *values) if is_jit else ():
+        assert one[name].index == two[name].index
+        assert (moved[name].index == two[name].index) == (name in values)
+    before = {name: np.array(two[name]) for name in (*placed, *values)}
+    # What one of them is given is its own, also in place.
+    to_world = mi.ScalarTransform4f().scale(3)
+    update(one, control_points=one["control_points"] * 2, cage_colour=one["cage_colour"] * 2, to_world=to_world)
+    dr.scatter(one["cage_texcoords"], 7.0, dr.uint32_array_t(type(one["cage_texcoords"]))(0))
+    one.update()
+    assert np.array(one["cage_texcoords"])[0] == 7
+    for name, factor in (("vertex_positions", 6), ("vertex_colour", 2)):
+        np.testing.assert_allclose(np.array(one[name]), factor * before[name], atol=10 * SINGLE)
+    if is_jit:
+        dr.scatter(two["vertex_positions"], 7.0, dr.uint32_array_t(type(two["vertex_positions"]))(0))
+    anew = mi.traverse(made(cage, shading=shading))
+    for name, expected in before.items():
+        np.testing.assert_array_equal(np.array(anew[name]), expected)
+        if name != "vertex_positions":
+            np.testing.assert_array_equal(np.array(two[name]), expected)
 
 
 @exact
@@ -320,23 +328,3 @@ def test_triangles_that_are_chosen_anew_keep_derivatives():
     shape.retessellate()
     dr.backward(dr.sum(mi.traverse(shape)["vertex_positions"]))
     assert np.array(dr.grad(shape.control_points)).any()
-
-
-@every_variant
-def test_shapes_of_equal_attributes_share_them_until_those_of_one_change():
-    cage, is_jit = with_attributes(cube()), dr.is_jit_v(mi.Float)
-    shapes = [made(given) for given in (cage, cage.with_positions(-cage.positions), coloured(cube(), 1))]
-    one, two, other = map(mi.traverse, shapes)
-    for name in ("colour", "texcoords", "weight", "label"):
-        assert not is_jit or one[f"cage_{name}"].index == two[f"cage_{name}"].index
-    for name in ("vertex_colour", "vertex_texcoords"):
-        assert not is_jit or one[name].index == two[name].index != other[name].index
-    before = {name: np.array(two[name]) for name in ("vertex_colour", "cage_texcoords")}
-    # What one of them is given is its own, also in place.
-    update(one, cage_colour=one["cage_colour"] * 2)
-    dr.scatter(one["cage_texcoords"], 7.0, dr.uint32_array_t(type(one["cage_texcoords"]))(0))
-    one.update()
-    np.testing.assert_allclose(np.array(one["vertex_colour"]), 2 * before["vertex_colour"], rtol=SINGLE)
-    assert np.array(one["cage_texcoords"])[0] == 7
-    for name, values in before.items():
-        np.testing.assert_array_equal(np.array(two[name]), values)
