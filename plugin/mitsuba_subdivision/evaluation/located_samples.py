@@ -138,7 +138,11 @@ class LocatedSamples:
             trees, samples = [*in_children], [np.concatenate(in_parents) for _, in_parents in in_children.values()]
         else:
             raise not_isolated(scheme, trees[0].signature)
-        uv = _turned(scheme, uv, leaf_turn)
+        # To the parameters of the leaves.
+        matrices, offsets = zip(*(domain.rotation(turn) for turn in range(domain.corner_count)), strict=True)
+        rotation: FloatArray = np.stack(matrices, axis=-1).take(leaf_turn, axis=-1)
+        uv = (rotation[:, 0] * uv[:, 0] + rotation[:, 1] * uv[:, 1] + np.stack(offsets, -1).take(leaf_turn, -1)).T
+        self.jacobian = rotation * speed
         self.leaves, begin = list[Leaves](), 0
         for patch, rows in in_leaves.items():
             in_patch = np.concatenate([in_tree for *_, in_tree in rows])
@@ -147,8 +151,6 @@ class LocatedSamples:
             parts = [(*row[:3], slice(end - len(row[3]), end)) for row, end in zip(rows, ends, strict=True)]
             self.leaves.append(Leaves(patch, uv[in_patch], parts))
             begin += len(in_patch)
-        rotations = np.stack([domain.rotation(turn).matrix for turn in range(domain.corner_count)], axis=-1)
-        self.jacobian: FloatArray = rotations.take(leaf_turn, axis=-1) * speed
 
     def chosen(self, which: IntArray) -> LocatedSamples:
         """Return a subset of the samples; ``which`` is in increasing order."""
@@ -258,15 +260,6 @@ def limit_stencils(located: LocatedSamples) -> list[FloatArray]:
             tangents.swapaxes(1, 2)[np.abs(tangents).sum(axis=1) <= rounded[:, samples]] = 0
             weights[:, 1:] = tangents.transpose(2, 0, 1)
     return stencils
-
-
-def _turned(scheme: Scheme, uv: FloatArray, turn: IntArray) -> FloatArray:
-    """Return parameters with (0, 0) at the first corner, from ``uv`` with (0, 0) at the corner ``turn``."""
-    turned = uv.copy()
-    for corner in np.flatnonzero(np.bincount(turn)[1:]) + 1:
-        is_turned = turn == corner
-        turned[is_turned] = scheme.domain.rotation(int(corner))(uv[is_turned])
-    return turned
 
 
 class Polynomials(NamedTuple):

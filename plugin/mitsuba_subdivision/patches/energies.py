@@ -8,7 +8,7 @@ the metric differs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 # Fraction of the energy around an extraordinary point that may be left out beyond the last level, by the ratio from
 # level to level that the eigenvalues give; and most levels.
 TAIL, MOST_LEVELS = 2.0**-20, 64
-# Numbers per run of patches and nodes, which bounds temporary memory.
+# Numbers per run of patches, which bounds temporary memory.
 CHUNK = 1 << 21
 # Order of the derivatives whose squares an energy integrates.
 FIRST, SECOND = 1, 2
@@ -57,38 +57,20 @@ def energy_matrix(
     derivative = FIRST if density is gradients else SECOND
     for patch_class in counted(table.classes, "Energies of patch classes"):
         first, shape = patch_class.first_control, patch_class.controls.shape
-        class_controls = controls[first : first + patch_class.controls.size].reshape(shape[::-1]).T
-        for run, local in _of_class(
-            table.scheme, patch_class.signature, points[class_controls], density, derivative, order
-        ):
-            entries = class_controls[run].astype(np.int32)
+        class_controls = controls[first : first + patch_class.controls.size].reshape(shape[::-1]).T.astype(np.int32)
+        basis, weights = _basis_derivatives(table.scheme, patch_class.signature, derivative, order)
+        run_length = max(1, CHUNK // (3 * basis[0].size))
+        for entries in np.split(class_controls, range(run_length, len(class_controls), run_length)):
+            relative = points[entries] - points[entries[:, :1]]
+            factors = density(basis, basis[:, None] @ relative) * np.sqrt(weights)[:, None, None]
+            factors = factors.reshape(len(entries), -1, entries.shape[1])
+            local = factors.swapaxes(1, 2) @ factors
             rows = np.repeat(entries, entries.shape[1], axis=1).ravel()
             columns = np.tile(entries, (1, entries.shape[1])).ravel()
             total = total + sparse.coo_array((local.ravel(), (rows, columns)), shape=total.shape).tocsr()
     if refinement is not None:
         total = refinement.T @ total @ refinement
     return sparse.csr_array((total + total.T) / 2)
-
-
-def _of_class(
-    scheme: Scheme, signature: Signature, points: FloatArray, density: Density, derivative: int, order: int
-) -> Iterator[tuple[slice, FloatArray]]:
-    """Iterate over runs of patches of a class, with the energy matrices ``(p, K, K)`` of these patches."""
-    basis, weights = _basis_derivatives(scheme, signature, derivative, order)
-    node_count, control_count = basis.shape[1:]
-    patches_at_once = max(1, CHUNK // (3 * control_count * min(node_count, control_count)))
-    for begin in range(0, len(points), patches_at_once):
-        run = slice(begin, begin + patches_at_once)
-        relative = points[run] - points[run, :1]
-        local = np.zeros((len(relative), control_count, control_count))
-        nodes_at_once = max(1, CHUNK // (3 * control_count * len(relative)))
-        for node in range(0, node_count, nodes_at_once):
-            nodes = slice(node, node + nodes_at_once)
-            point_derivatives = basis[:, None, nodes] @ relative[None]
-            factors = density(basis[:, nodes], point_derivatives) * np.sqrt(weights[nodes])[:, None, None]
-            factors = factors.reshape(len(relative), -1, control_count)
-            local += factors.swapaxes(1, 2) @ factors
-        yield run, local
 
 
 def _basis_derivatives(

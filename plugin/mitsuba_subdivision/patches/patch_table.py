@@ -266,11 +266,7 @@ class PatchTable:
         Returns these corners and the codes.
         """
         count = self.scheme.domain.corner_count
-        if fans.size == count * len(corners):
-            # All elements are whole, and their corners are consecutive.
-            at_corners = np.ascontiguousarray(fans.reshape(-1, count).T)
-        else:
-            at_corners = fans[corners + np.arange(count)[:, None]]
+        at_corners = fans[corners + np.arange(count)[:, None]]
         if self.scheme.element == "vertex":
             codes = row_codes([at_corners.ravel()])
         else:

@@ -214,6 +214,34 @@ class SurfacePieces:
                 tips.setdefault(part.patch, []).append(part)
         return cls(PolynomialPieces.joined(regular), tuple(Tips.joined(alike) for alike in tips.values()), sizes)
 
+    def element_bounds(
+        self,
+        elements: Topology,  # `PatchTable.elements`
+    ) -> tuple[FloatArray, FloatArray]:
+        """Corners ``(n_e, 3)`` of boxes around all elements; inverted and infinite for faces that are no elements."""
+        lower, upper = np.full_like(self.sizes, np.inf), np.full_like(self.sizes, -np.inf)
+
+        def widen(half_edge: IntArray, low: FloatArray, high: FloatArray) -> None:
+            element = elements.face[half_edge]
+            np.minimum.at(lower, element, low)
+            np.maximum.at(upper, element, high)
+
+        for make_part in self.parts(lambda tips: tips.bounded_levels):
+            part = make_part()
+            # HALVINGS of the element, minus those that led to the piece.
+            size = np.sqrt(np.abs(np.linalg.det(part.matrices)))
+            halvings = np.maximum(HALVINGS - np.rint(-np.log2(size)).astype(np.int64), 0)
+            for count in np.unique(halvings).tolist():
+                matrix, of_size = _divided(part.basis, count), part.chosen(np.flatnonzero(halvings == count))
+                for run, columns in of_size.runs(CHUNK):
+                    divided, origins = times(matrix, columns), of_size.origins[run]
+                    widen(of_size.half_edge[run], origins + divided.min(axis=0).T, origins + divided.max(axis=0).T)
+        for tips in self.tips:
+            reach = tips.reach(tips.bounded_levels)
+            widen(tips.half_edge, tips.points - reach, tips.points + reach)
+        rounded = UNITS * UNIT * self.sizes
+        return lower - rounded, upper + rounded
+
 
 def _places(
     patches: PatchTable,
@@ -260,37 +288,6 @@ class ElementBounds:
     element: IntArray
     lower: FloatArray
     upper: FloatArray
-
-
-def element_bounds(
-    pieces: SurfacePieces,
-    elements: Topology,  # `PatchTable.elements`
-) -> tuple[FloatArray, FloatArray]:
-    """Corners ``(n_e, 3)`` of boxes around all elements; inverted and infinite for faces that are no elements."""
-    lower, upper = np.full_like(pieces.sizes, np.inf), np.full_like(pieces.sizes, -np.inf)
-
-    def widen(half_edge: IntArray, low: FloatArray, high: FloatArray) -> None:
-        element = elements.face[half_edge]
-        np.minimum.at(lower, element, low)
-        np.maximum.at(upper, element, high)
-
-    def widen_by(part: PolynomialPieces) -> None:
-        # HALVINGS of the element, minus those that led to the piece.
-        size = np.sqrt(np.abs(np.linalg.det(part.matrices)))
-        halvings = np.maximum(HALVINGS - np.rint(-np.log2(size)).astype(np.int64), 0)
-        for count in np.unique(halvings).tolist():
-            matrix, pieces_of_size = _divided(part.basis, count), part.chosen(np.flatnonzero(halvings == count))
-            for run, columns in pieces_of_size.runs(CHUNK):
-                divided, origins = times(matrix, columns), pieces_of_size.origins[run]
-                widen(pieces_of_size.half_edge[run], origins + divided.min(axis=0).T, origins + divided.max(axis=0).T)
-
-    for part in pieces.parts(lambda tips: tips.bounded_levels):
-        widen_by(part())
-    for tips in pieces.tips:
-        reach = tips.reach(tips.bounded_levels)
-        widen(tips.half_edge, tips.points - reach, tips.points + reach)
-    rounded = UNITS * UNIT * pieces.sizes
-    return lower - rounded, upper + rounded
 
 
 @lru_cache(maxsize=64)

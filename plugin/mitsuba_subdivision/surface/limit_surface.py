@@ -421,9 +421,7 @@ class LimitSurface:
 
     @cached_property
     def _bounds(self) -> tuple[FloatArray, FloatArray]:
-        from ..patches.polynomial_pieces import element_bounds
-
-        return element_bounds(self._surface_pieces, self.patches.elements)
+        return self._surface_pieces.element_bounds(self.patches.elements)
 
     @cached_property
     def _areas(self) -> tuple[list[FloatArray], float]:
