@@ -80,7 +80,7 @@ def chord_error(surface: LimitSurface, table: VertexTable) -> float:
     inside = (i + j <= STEPS) & (np.max([i, j, STEPS - i - j], axis=0) < STEPS)
     weights = np.stack([i, j, STEPS - i - j], axis=1)[inside] / STEPS
     kernel, distances = surface.on_device("llvm_ad_rgb_double"), []
-    types, location_of = kernel.types, TriangleLocations(table, kernel.walk, kernel.types)
+    types, location_of = kernel.types, TriangleLocations(table, kernel.walk)
     for begin in range(0, len(table.triangles), TRIANGLES_AT_ONCE):
         triangles = np.arange(begin, min(begin + TRIANGLES_AT_ONCE, len(table.triangles)))
         points = (weights @ positions[table.triangles[triangles]]).reshape(-1, 3)

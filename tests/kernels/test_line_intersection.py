@@ -179,7 +179,7 @@ def first_hits(o, d, corners):
 def test_the_nearest_of_the_hits_on_all_pieces_is_that_on_a_fine_tessellation(name, np_rng):
     """From some places on each piece, whatever the ray: only hits inside of the piece count."""
     surface, kernel = surface_named(name), kernel_named(name, DOUBLE)
-    types, patches = kernel.types, PieceKernel.shared(surface.pieces(), kernel.types.float)
+    types, patches = kernel.types, PieceKernel(surface.pieces(), kernel.types.float)
     o = np_rng.normal(size=(50, 3))
     o *= 6 / np.linalg.norm(o, axis=1)[:, None]
     d = surface.sample(50, 3).p + 0.2 * np_rng.normal(size=(50, 3)) - o

@@ -126,7 +126,7 @@ def as_seen_from_first(surface, half_edge, uv):
 def made(name, rate):
     surface = surface_named(name)
     kernel, table = kernel_named(name, "llvm_ad_rgb_double"), surface.sampling(rate)
-    return surface, kernel, table, TriangleLocations(table, kernel.walk, kernel.types)
+    return surface, kernel, table, TriangleLocations(table, kernel.walk)
 
 
 @pytest.mark.parametrize("name", TRIANGULATED)

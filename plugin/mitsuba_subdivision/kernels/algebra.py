@@ -12,15 +12,13 @@ from functools import reduce
 
 import drjit as dr
 
-from .array_types import ArrayTypes, Float, Mask, Matrix4, Value, Vector3
+from .array_types import Float, Mask, Matrix4, Value, Vector3
 
 # Longest Newton step, in parameters of an element: outside of its element, a polynomial may be far from the surface.
 LONGEST_STEP = 0.5
 # Tolerance of a Newton step's length, in parameters of a piece: a next step would be about as long as the square of
 # this. The second one is for nearest points in double precision, which their derivatives depend on.
 STEP_TOLERANCE, STEP_TOLERANCE_DOUBLE = 3e-4, 1e-7
-# Rounding error of the difference of two points, relative to their coordinates: some units in the last place (ulp).
-_ROUNDING_SINGLE, _ROUNDING_DOUBLE = 2.0**-21, 2.0**-50
 
 
 def dot(a: Sequence[Float], b: Sequence[Float]) -> Float:
@@ -65,11 +63,6 @@ def selected(condition: Mask, a: Sequence[Float], b: Sequence[Float]) -> list[Fl
 def like(components: list, vector: Vector3) -> Vector3:
     """Make a vector of the same type as ``vector`` from three components."""
     return components if isinstance(vector, list) else type(vector)(*components)
-
-
-def rounding(types: ArrayTypes) -> float:
-    """Rounding error of the difference of two points, relative to their coordinates."""
-    return _ROUNDING_DOUBLE if types.is_double else _ROUNDING_SINGLE
 
 
 def step_along(r: Vector3, d: Vector3, du: Vector3, dv: Vector3) -> tuple[Float, Float]:

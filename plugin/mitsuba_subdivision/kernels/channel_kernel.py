@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import drjit as dr
 
+from ..mesh.shared import shared
 from ..patches import PieceTable
 from .algebra import Monomials
 from .array_types import ArrayTypes, Float, Index, Mask, Value
@@ -35,7 +36,7 @@ class ChannelKernel:
             linear_map = SparseMatrix(channel.linear_polynomials, float_type, is_relative=False)
         else:
             table = PieceTable.build(channel.layout.patches, channel.layout.value_index, len(channel.values))
-            self._pieces, linear_map = PieceKernel.shared(table, float_type), CoefficientMap.shared(table, float_type)
+            self._pieces, linear_map = shared(PieceKernel, table, float_type), shared(CoefficientMap, table, float_type)
         self._types, self.values = types, ControlValues(types, size, linear_map).load(channel.values)
 
     def __call__(self, location: Location, active: Mask = True) -> tuple[Value, Value, Value]:

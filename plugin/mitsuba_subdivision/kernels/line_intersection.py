@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from .algebra import LONGEST_STEP, STEP_TOLERANCE, dot, over, rounding, step_along
+from .algebra import LONGEST_STEP, STEP_TOLERANCE, dot, over, step_along
 from .array_types import ArrayTypes, Float, Index, Mask, Vector3
 from .locations import ElementWalk, Location
 from .piece_kernel import PatchValues, Piece
@@ -75,7 +75,6 @@ def line_hits(
     a point on a border or a crease beside the line, or `MISSED`; and the surface there, without second derivatives.
     """
     types = walk.types
-    relative_rounding = rounding(types)
 
     def search(aim, round_count, side, is_held, d, half_edge, u, v, *_):
         row = walk.row(half_edge, active)
@@ -94,7 +93,7 @@ def line_hits(
         coordinate_size = dr.sqrt(dot(p, p)) + dr.sqrt(dot(surface.value, surface.value))
         longest_derivative = dr.sqrt(dr.maximum(dot(surface.du, surface.du), dot(surface.dv, surface.dv)))
         last_step = dr.clip(
-            over(relative_rounding * coordinate_size * piece.magnification, longest_derivative), STEP_TOLERANCE, 1
+            over(types.rounding * coordinate_size * piece.magnification, longest_derivative), STEP_TOLERANCE, 1
         )
         parameter_change = dr.maximum(dr.abs(target.u - u), dr.abs(target.v - v))
         has_settled = is_finite & (dr.minimum(length, parameter_change) * piece.magnification < last_step)

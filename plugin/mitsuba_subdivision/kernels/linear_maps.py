@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from ..patches import PieceTable
 
 _MATRICES: Shared[SparseMatrix] = Shared()
-_MAPS: Shared[CoefficientMap] = Shared()
 _MADE: Shared[LaterArrays] = Shared()
 
 
@@ -279,11 +278,6 @@ class CoefficientMap:
         # Control points stored among the coefficients: their indices; the indices of their origins, or `NOTHING`; and
         # their packets.
         self._rings = [types.indices(column) for column in np.concatenate(rings, axis=1)] if rings else None
-
-    @classmethod
-    def shared(cls, table: PieceTable, float_type: type) -> CoefficientMap:
-        """The map of a table, shared by all callers."""
-        return _MAPS.get((table, float_type), lambda: cls(table, float_type))
 
     def __call__(
         self,

@@ -148,7 +148,8 @@ class TriangleLocations:
     whole elements and once for those of all corners of others.
     """
 
-    def __init__(self, table: VertexTable, walk: ElementWalk, types: ArrayTypes) -> None:
+    def __init__(self, table: VertexTable, walk: ElementWalk) -> None:
+        types = walk.types
         self._types, self._walk, self._half_edge, self._element = types, walk, None, None
         if not isinstance(table.grid, UniformGrid):
             half_edge, uv = cast("AdaptiveGrid", table.grid).triangle_locations

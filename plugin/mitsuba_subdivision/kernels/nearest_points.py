@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from .algebra import LONGEST_STEP, STEP_TOLERANCE, STEP_TOLERANCE_DOUBLE, rounding
+from .algebra import LONGEST_STEP, STEP_TOLERANCE, STEP_TOLERANCE_DOUBLE
 from .array_types import Float, Mask, Vector3
 from .locations import ElementWalk, Location
 from .piece_kernel import PatchValues, Piece
@@ -63,7 +63,7 @@ def nearest_locations(
     types = walk.types
     last_step = STEP_TOLERANCE_DOUBLE if types.is_double else STEP_TOLERANCE
     shortest_step = GIVEN_UP_DOUBLE if types.is_double else GIVEN_UP_SINGLE
-    relative_rounding = rounding(types)
+    relative_rounding = types.rounding
 
     def step(steps_left, half_edge, u, v, squared_distance, du, dv, step_factor, *_):
         target = Location(half_edge, u + step_factor * du, v + step_factor * dv)

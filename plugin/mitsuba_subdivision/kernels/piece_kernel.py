@@ -18,7 +18,6 @@ import drjit as dr
 from ..evaluation.patch_tree import PartKind
 from ..evaluation.polynomials import polynomial_basis
 from ..evaluation.tree_arrays import LEVEL_PIECES, PIECE_LEVELS, FrameKind
-from ..mesh.shared import Shared
 from ..patches.piece_table import (
     CODE,
     CONTROL,
@@ -236,7 +235,6 @@ class PieceKernel:
         self,
         table: PieceTable,
         float_type: type,  # Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``
-        *,
         # Whether tips are evaluated by (9) and (11) instead of (10) and (12). Their levels must have no pieces.
         use_stam: bool = False,
     ) -> None:
@@ -262,11 +260,6 @@ class PieceKernel:
             self._weights = types.floats(table.weights(self._row_size, types.numpy_float))
             self._rings = types.indices(table.rings)
         self._is_split = table.refinement is not None
-
-    @classmethod
-    def shared(cls, table: PieceTable, float_type: type, *, use_stam: bool = False) -> PieceKernel:
-        """The kernel of a table, shared by all callers."""
-        return _KERNELS.get((table, float_type, use_stam), lambda: cls(table, float_type, use_stam=use_stam))
 
     def piece(
         self,
@@ -445,6 +438,3 @@ def differences(vectors: Callable[[Float, Float], Sequence[Vector3]], magnificat
             [(ahead - behind) * inverse for ahead, behind in zip(vectors(u, v), vectors(-u, -v), strict=True)]
             for u, v in ((step, 0), (0, step))
         ]
-
-
-_KERNELS: Shared[PieceKernel] = Shared()

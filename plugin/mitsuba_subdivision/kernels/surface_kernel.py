@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import drjit as dr
 import numpy as np
 
-from .algebra import AffineMap, cross, over, rounding, unit
+from ..mesh.shared import shared
+from .algebra import AffineMap, cross, over, unit
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector3
 from .line_intersection import MISSED, ON_LINE, Lines, line_hits
 from .linear_maps import CoefficientMap, ControlValues
@@ -91,13 +92,13 @@ class SurfaceKernel:
     ) -> None:
         self.types = ArrayTypes(float_type)
         self._make_cells = cells
-        self._patches = PieceKernel.shared(table, float_type, use_stam=use_stam)
+        self._patches = shared(PieceKernel, table, float_type, use_stam)
         self.walk = self._patches.walk  # Over the surface's elements
         # Displacement of the surface. All results are those of the displaced surface, and differentiable with respect
         # to the heights and their scale.
         self.displacement: Displacement | None = None
         self._control_count = table.control_count
-        self.values = ControlValues(self.types, 3, CoefficientMap.shared(table, float_type))  # Its control points
+        self.values = ControlValues(self.types, 3, shared(CoefficientMap, table, float_type))  # Its control points
 
     def set_control_points(self, points: FloatBuffer) -> None:
         """Set the control points. Later results are differentiable with respect to them.
@@ -185,7 +186,7 @@ class SurfaceKernel:
         tolerance = dr.square(NEAR_LINE) * dr.maximum(dr.squared_norm(points.dp_du), dr.squared_norm(points.dp_dv))
         # Next to extraordinary points, rounding errors exceed this distance.
         squared_size = dr.squared_norm(dr.detach(points.p)) + dr.squared_norm(dr.detach(along_ray))
-        is_on_line = squared_distance < dr.maximum(tolerance, dr.square(rounding(self.types)) * squared_size)
+        is_on_line = squared_distance < dr.maximum(tolerance, dr.square(self.types.rounding) * squared_size)
         t = dr.select((kind != MISSED) & is_on_line, t, dr.inf)
         return replace(points, t=t)
 

@@ -78,3 +78,11 @@ class Shared(Generic[Value]):
             finally:
                 with self._lock:
                     self._making.pop(key, None)
+
+
+_OBJECTS: Shared[Any] = Shared()
+
+
+def shared(kind: Callable[..., Value], *arguments: Hashable) -> Value:
+    """Return ``kind(*arguments)``, which is made once for equal arguments and shared while it is referenced."""
+    return _OBJECTS.get((kind, *arguments), lambda: kind(*arguments))

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from ..cage.errors import warn
 from ..device_arrays import upload
 from ..kernels.array_types import ArrayTypes, Float, FloatBuffer, Index, Mask, Value
-from ..mesh.shared import Shared, SharedArray
+from ..mesh.shared import SharedArray, shared
 from ..variants import Variant
 from .derivatives import Watched, computed_ones, warn_of_lost
 from .device_state import flat_type, require_values
@@ -35,7 +35,7 @@ from .parameter_table import errors_about
 
 if TYPE_CHECKING:
     from ..cage import ControlCage
-    from ..patches import Channel
+    from ..patches import Channel, ChannelLayout
     from ..surface import LimitSurface
     from ..tessellation.attribute_table import AttributeTable
 
@@ -106,7 +106,7 @@ class CageAttributes:
         shown = {name: values for name, values in self._loaded.items() if name in self._channels}
         self._uploaded = {name: self._upload(values.astype(np.float32)) for name, values in shown.items()}
         self._locations = attributes.layout.locate
-        self._weights: dict[tuple, Any] = {}
+        self._weights: dict[ChannelLayout, Any] = {}
 
     def update(self, keys: Iterable[str]) -> list[str]:
         """Apply the parameters of this object that are named in ``keys``.
@@ -157,23 +157,22 @@ class CageAttributes:
         return np.asarray(vertex_values, dtype=np.float32).ravel()
 
     @property
-    def all_weights(self) -> dict[tuple, Any]:
+    def all_weights(self) -> dict[ChannelLayout, Any]:
         """Weights of all attributes, computed if necessary."""
         for name in self._uploaded:
             self._weights_of(self._channels[name])
         return self._weights
 
     def _weights_of(self, channel: Channel) -> Any:
-        # Attributes that share control vertices and patches share weights.
-        key = type(channel), id(channel.layout.patches), channel.layout.value_index.tobytes()
-        if key not in self._weights:
+        # Attributes of the same layout share weights.
+        if channel.layout not in self._weights:
             weights: Any = channel.weights(*self._locations())
             if self._float is not None:
                 from ..kernels.linear_maps import SparseMatrix
 
                 weights = SparseMatrix(weights, self._float)
-            self._weights[key] = weights
-        return self._weights[key]
+            self._weights[channel.layout] = weights
+        return self._weights[channel.layout]
 
     def _move(self, name: str) -> None:
         values = self.values[f"{PREFIX}{name}"]
@@ -214,7 +213,7 @@ def spectral_upsampling(variant: Variant, sizes: dict[str, int]) -> dict[str, Sp
     colors = [name for name, size in sizes.items() if size == 3 and "color" in name.lower()]
     if not (colors and variant.is_spectral):
         return {}
-    return dict.fromkeys(colors, _UPSAMPLING.get(variant, lambda: SpectralUpsampling(variant)))
+    return dict.fromkeys(colors, shared(SpectralUpsampling, variant))
 
 
 class SpectralUpsampling:
@@ -292,6 +291,3 @@ class SpectralUpsampling:
         constant = dr.select(is_inside, (clamped - 0.5) / dr.sqrt(clamped * (1 - clamped)), 0)
         constant = dr.select(value <= 0, _BLACK, dr.select(value >= 1, _WHITE, constant))
         return self._variant.Color3f(0, 0, constant)
-
-
-_UPSAMPLING: Shared[SpectralUpsampling] = Shared()

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from ..patches import Channel
     from ..tessellation.attribute_table import AttributeLayout
     from .exact_shading import ExactShading
+    from .parameters import Parameters
 
 # Step of central differences of a texture, in texture coordinates.
 DIFFERENCE = 2.0**-10
@@ -64,12 +65,11 @@ class ShapeDisplacement:
     def __init__(
         self,
         variant: Variant,
-        surface: LimitSurface,
+        parameters: Parameters,
         positions: FloatArray,  # (n, 3) float64: control points, relative to the centre of `Placement`
-        given: Any,  # Value of the parameter ``displacement``
-        scale: float,
         exact: ExactShading | None,  # Exact shading of the shape, whose surface is displaced, too
     ) -> None:
+        surface, given, scale = parameters.surface, parameters.displacement, parameters.displacement_scale
         self._is_jit = dr.is_jit_v(variant.Float)
         # Name of the channel that the heights depend on: an attribute, or "texcoords".
         self.attribute = _attribute_named(given, surface) if isinstance(given, str) else TEXCOORDS

@@ -18,9 +18,9 @@ from ..kernels.line_intersection import ON_LINE, Lines
 from ..kernels.locations import Location, TriangleLocations
 from ..kernels.surface_kernel import SurfaceKernel, SurfacePoints
 from ..mesh.connectivity import IntArray
-from ..mesh.shared import Shared
+from ..mesh.shared import shared
 from ..schemes.domain import FloatArray
-from ..surface import TEXCOORDS, LimitSurface
+from ..surface import TEXCOORDS
 from ..variants import Variant
 from .cage_attributes import WIDTHS, mesh_name, spectral_upsampling
 from .placement import Placement
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from ..kernels.channel_kernel import ChannelKernel
     from ..tessellation.vertex_table import VertexTable
     from .interaction_hook import TriangleHit
+    from .parameters import Parameters
 
 # Cosine of the angle between a ray and the normals that `_facing` turns to a silhouette.
 GRAZING = 1e-2
@@ -39,8 +40,6 @@ _PARAMETERS = int(mi.RayFlags.UV) | int(mi.RayFlags.dPdUV) | _NORMAL_DERIVATIVES
 _KINDS = ("are on the ray", "are along the normal nearby", "are shaded where the triangle lies in the surface")
 _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 
-# Locations on triangles, shared by shapes with the same tessellation and elements.
-_TRIANGLES: Shared[TriangleLocations] = Shared()
 # Number of fixed-point iterations of `hit_by_texcoords`. Each removes most of the difference between texture
 # coordinates on the surface and on its triangles.
 STEPS = 3
@@ -57,17 +56,15 @@ class ExactShading:
     def __init__(
         self,
         variant: Variant,
-        surface: LimitSurface,
+        parameters: Parameters,
         # (n, 3) float64: control points of the surface, relative to the centre of `Placement`
         positions: NDArray[np.float64],
-        *,
-        use_stam: bool,  # Whether to evaluate by Stam's form
     ) -> None:
+        surface, evaluator = parameters.surface, parameters.evaluator
         self._variant = variant
         self._name = surface.cage.source.name
-        pieces = surface.pieces("stam" if use_stam else "stabilized")
         # The surface in object space, relative to the centre
-        self.kernel = SurfaceKernel(pieces, variant.Float, use_stam=use_stam)
+        self.kernel = SurfaceKernel(surface.pieces(evaluator), variant.Float, use_stam=evaluator == "stam")
         self.kernel.values.load(positions)
         self.to_world: Matrix4 = self.kernel.types.matrix4(1)  # For points relative to the centre
         self._counts: IndexBuffer = dr.zeros(self.kernel.types.index, len(_KINDS))
@@ -91,9 +88,9 @@ class ExactShading:
 
     def set_triangles(self, table: VertexTable, kept: IntArray | None = None) -> None:
         """Set the triangles of the shape before the first hit: all of a table, or those with the indices ``kept``."""
-        walk, types = self.kernel.walk, self.kernel.types
-        self._triangles = _TRIANGLES.get((table, walk), lambda: TriangleLocations(table, walk, types))
-        self._kept = None if kept is None else types.indices(kept)
+        # Shapes with the same tessellation and elements share locations.
+        self._triangles = shared(TriangleLocations, table, self.kernel.walk)
+        self._kept = None if kept is None else self.kernel.types.indices(kept)
 
     def _located(self, triangle: Index, b1: Float, b2: Float, active: Mask) -> Location:
         """The location of a point of a triangle of the shape, see `TriangleLocations`."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..device_arrays import mapped
 from ..kernels.array_types import ArrayTypes, FloatBuffer, IndexBuffer, LaterArrays, Matrix4
 from ..mesh.connectivity import IntArray
-from ..mesh.shared import Content, Shared, SharedArray
+from ..mesh.shared import Content, Shared, SharedArray, shared
 from ..surface import TEXCOORDS, LimitSurface
 from ..variants import Variant
 from .derivatives import Watched, computed_ones, warn_of_lost
@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from .exact_shading import ExactShading
     from .parameters import Parameters
 
-# Kernels and arrays, shared by shapes with the same tessellation.
-_KERNELS: Shared[VertexKernel] = Shared()
+# Arrays, shared by shapes with the same tessellation.
 _SHARED: Shared[SharedArray] = Shared()
 # Vertices of loaded control points in object space, shared by shapes of equal cages, and their largest number: few take
 # longer to trace than to compute, and more take memory.
@@ -76,7 +75,7 @@ class MeshBuffers:
         if is_jit and not self._is_sampled:
             from ..kernels import VertexKernel
 
-            self._kernel = _KERNELS.get((table, variant.Float), lambda: VertexKernel(table, variant.Float))
+            self._kernel = shared(VertexKernel, table, variant.Float)
         # Whether vertices are differentiable with respect to control points, placement and displacement.
         self.are_differentiable = self._kernel is not None and dr.is_diff_v(variant.Float)
         self._computed: set[int] = set()

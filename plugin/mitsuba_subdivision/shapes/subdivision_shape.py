@@ -73,21 +73,13 @@ def make_subdivision(
             if is_exact:
                 from .exact_shading import ExactShading
 
-                use_stam = parameters.evaluator == "stam"
-                self._exact = ExactShading(variant, surface, self._placement.positions, use_stam=use_stam)
+                self._exact = ExactShading(variant, parameters, self._placement.positions)
             self._displacement: ShapeDisplacement | None = None
             if parameters.displacement is not None:
                 from .displacement import ShapeDisplacement
 
                 with errors_about("displacement"):
-                    self._displacement = ShapeDisplacement(
-                        variant,
-                        surface,
-                        self._placement.positions,
-                        parameters.displacement,
-                        parameters.displacement_scale,
-                        self._exact,
-                    )
+                    self._displacement = ShapeDisplacement(variant, parameters, self._placement.positions, self._exact)
             attributes = mesh_attributes(surface.cage)
             exposed = [name for name in (TEXCOORDS, *attributes) if name in surface.attribute_names]
             channels = {} if self._exact is None else self._exact.channels
