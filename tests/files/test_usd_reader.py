@@ -112,12 +112,10 @@ def test_equal_texture_coordinates_without_indices_are_shared(read, end, shared)
     index = cage.texcoords.indices
     assert len(cage.texcoords.values) == len(set(index.tolist())) == (6 if shared else 8)
     assert [index[1] == index[4], index[2] == index[7]] == [shared, shared]
-
-
-def test_corners_of_other_vertices_share_no_value(read):
-    cage = read('float[] primvars:a = [1, 1, 1, 1, 1, 1, 2, 1] (interpolation = "faceVarying")')
-    assert cage.attributes["a"].values.ravel().tolist() == [1, 1, 1, 1, 1, 2]
-    index = cage.attributes["a"].indices.tolist()
+    # Corners of other vertices share no value.
+    numbers = read('float[] primvars:a = [1, 1, 1, 1, 1, 1, 2, 1] (interpolation = "faceVarying")').attributes["a"]
+    assert numbers.values.ravel().tolist() == [1, 1, 1, 1, 1, 2]
+    index = numbers.indices.tolist()
     assert (index[1], index[2], len(set(index))) == (index[4], index[7], 6)
 
 

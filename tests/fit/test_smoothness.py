@@ -67,18 +67,6 @@ def test_gradients_of_folds_are_differences(np_rng):
     np.testing.assert_allclose(gradient, expected, atol=DIFFERENCE)
 
 
-def test_a_folded_cage_opens():
-    """Where nothing else holds it."""
-    cage = book(2.9)
-    points = upload(mi.Float, cage.positions)
-    optimizer = mi.ad.Adam(lr=0.05, params={"points": points})
-    energy = folds(cage)
-    for _ in range(40):
-        dr.backward(energy(optimizer["points"]))
-        optimizer.step()
-    assert value(cage, np.array(optimizer["points"])) == 0
-
-
 # Sums of some hundred terms in single precision.
 SINGLE = 2e-5
 
@@ -124,17 +112,6 @@ def test_coordinates_and_points_are_inverse_and_derivatives_solve_the_same_syste
         np.testing.assert_allclose(np.array(solution).reshape(-1, 3), expected, atol=SINGLE)
 
 
-def test_a_step_of_one_point_moves_what_is_around(surface):
-    """Less with the distance, and all by the same in sum: constants are left as they are."""
-    steps = LargeSteps(surface.cage.laplacian(), 4.0)
-    step = np.zeros((surface.cage.vertex_count, 3))
-    step[0, 2] = 1
-    moved = np.array(steps.from_differential(upload(mi.Float, step))).reshape(-1, 3)[:, 2]
-    assert (moved > 0).all()
-    assert moved.argmax() == 0
-    np.testing.assert_allclose(moved.sum(), 1, atol=SINGLE)
-
-
 @pytest.mark.core
 @pytest.mark.parametrize("name", ["laplacian", "bending", "anchor"])
 def test_regularizers_are_quadratic_forms_of_these_matrices(surface, np_rng, name):
@@ -151,15 +128,6 @@ def test_regularizers_are_quadratic_forms_of_these_matrices(surface, np_rng, nam
     dr.backward(value)
     assert float(np.array(value)[0]) == pytest.approx((away * product).sum() / 2, rel=SINGLE)
     np.testing.assert_allclose(np.array(flat.grad).reshape(-1, 3), product, atol=SINGLE * np.abs(product).max())
-
-
-def test_where_regularizers_are_least(surface):
-    """The anchor is where the cage begins; others do not notice where the whole cage is."""
-    points = surface.cage.positions
-    assert not (quadratic_form("anchor", surface)[1] - points).any()
-    for name in ("laplacian", "bending"):
-        moved = quadratic_form(name, surface)[0] @ np.ones_like(points)
-        np.testing.assert_allclose(moved, 0, atol=1e-12)
 
 
 def test_an_unknown_regularizer_and_a_lambda_of_zero_are_refused(surface):
