@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import Attribute, CageWarning, ControlCage, LimitSurface
 from mitsuba_subdivision.__main__ import main
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary_face, tetrahedron, torus
+from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.inspection import in_words, inspect
+from patches.closed_cages import extraordinary_face, tetrahedron, torus
 from reference.exact_samples import faces_of
 from reference.refined_cages import sheet
 

@@ -205,7 +205,6 @@ import numpy as np
 from pathlib import Path
 import mitsuba_subdivision as msub
 import mitsuba as mi
-from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.figures.staging import draw_picture
 from mitsuba_subdivision.figures.output import FigureOptions
 from mitsuba_subdivision.regression.image import write_exr

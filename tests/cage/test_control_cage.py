@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage import Attribute, CageError, ControlCage
 from mitsuba_subdivision.cage.contents import RULES, CageContents
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary
+from patches.closed_cages import torus
 from reference.refined_cages import tagged
 
 

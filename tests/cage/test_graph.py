@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import named_cages
-from patches.closed_cages import mixed_torus, polygons
+from patches.closed_cages import mixed_torus, polygons, torus
 from peers.fidelity_cages import SURFACES
 from peers.test_fidelity import surface_of
 
@@ -49,7 +49,7 @@ def test_the_laplacian_is_the_sum_of_squares_along_edges(cage, np_rng):
 
 def test_edges_of_many_vertices():
     """Numbers of pairs of vertices are beyond 32 bits from 46,341 vertices on."""
-    cage = named_cages.torus(230, 210)
+    cage = torus(230, 210)
     t = cage.topology
     ends = np.stack([t.face_vertices, t.face_vertices[t.next]], axis=1)[t.edge_half_edge]
     expected = np.sort(ends, axis=1)

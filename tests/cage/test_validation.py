@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage
 from mitsuba_subdivision.cage.errors import CageSource
-from mitsuba_subdivision.cage.named_cages import cube, tetrahedron, torus
+from mitsuba_subdivision.cage.named_cages import cube
+from patches.closed_cages import tetrahedron, torus
 from reference.refined_cages import tagged
 
 POINTS = np.random.default_rng(1).random((9, 3))

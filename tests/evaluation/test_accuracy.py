@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from evaluation.common import EVERY_SCHEME, assert_exact, curvatures
 from mitsuba_subdivision import LimitSurface, SchemeError, limit_stencil
-from mitsuba_subdivision.cage.named_cages import extraordinary, torus
-from patches.closed_cages import cage_of
+from mitsuba_subdivision.cage.named_cages import extraordinary
+from patches.closed_cages import cage_of, torus
 from reference import bars
 from reference.bars import CURVATURE, DERIVATIVE, NORMAL, POINT, SECOND_DERIVATIVE
 from reference.brute_force import BruteForce

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.contents import Attribute
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles, torus
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary
+from patches.closed_cages import extraordinary_triangles, torus
 from reference.exact_samples import faces_of
 from reference.refined_cages import half_disc, sheet, tagged
 from reference.refinement import Channel, refined

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from evaluation.common import both_sides, evaluate_from
 from mitsuba_subdivision import CageError, ControlCage, LimitSurface, SchemeError
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.evaluation import irregular_patch, patch_tree
 from mitsuba_subdivision.mesh.connectivity import VertexRule
-from patches.closed_cages import cube_with_valence_2
+from patches.closed_cages import cube_with_valence_2, extraordinary_face, extraordinary_triangles
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import (
     differences_to_refined,

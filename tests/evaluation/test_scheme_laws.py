@@ -5,10 +5,11 @@ import pytest
 from evaluation.common import ChangedCatmullClark
 from mitsuba_subdivision import LimitSurface, SchemeError, check_scheme, register_scheme
 from mitsuba_subdivision.cage.contents import Attribute
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_triangles
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop, Refinement, Scheme, StencilTable
 from mitsuba_subdivision.schemes.domain import SQUARE
 from mitsuba_subdivision.schemes.scheme import PhantomPoint, tensor_basis
+from patches.closed_cages import extraordinary_triangles
 from reference.refined_cages import refined, sheet, tagged
 
 # Rounding over some levels of refinement of the unit ball.

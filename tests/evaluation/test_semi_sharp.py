@@ -7,11 +7,11 @@ import pytest
 from evaluation.common import both_sides, evaluate_from
 from evaluation.random_cages import octahedron
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.schemes import CatmullClark
-from patches.closed_cages import prism
+from patches.closed_cages import extraordinary_face, extraordinary_triangles, prism
 from reference.exact_samples import angle, faces_of
 from reference.refined_cages import differences_to_refined, refined, sheet, spokes, tagged, upper_half, with_bumps
 from reference.refinement import SharpMesh

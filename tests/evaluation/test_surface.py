@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface, SchemeError, limit_stencil
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.schemes import CatmullClark, scheme_named, with_rules
+from patches.closed_cages import tetrahedron
 
 
 def test_arguments_broadcast():

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, example_file
 from mitsuba_subdivision.__main__ import parser
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary, torus
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.figures import FIGURES, FigureError, FigureOptions, peers
 from mitsuba_subdivision.figures.cages import (
     INFINITE,
@@ -41,6 +41,7 @@ from mitsuba_subdivision.figures.staging import project, visible
 from mitsuba_subdivision.figures.user_cage import around_vertices, frame
 from mitsuba_subdivision.regression.image import read_channels
 from mitsuba_subdivision.schemes import scheme_named
+from patches.closed_cages import torus
 from scipy.spatial import cKDTree
 
 # Small enough that all together take seconds.

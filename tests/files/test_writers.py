@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface
 from mitsuba_subdivision.__main__ import main
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.files.formats import write_triangles
 from mitsuba_subdivision.files.obj_writer import write_obj
+from patches.closed_cages import tetrahedron
 
 
 @pytest.fixture(scope="module")

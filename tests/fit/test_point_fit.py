@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.cage.named_cages import cube, torus
+from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.fit import PointFit, Schedule, to_mesh
+from patches.closed_cages import torus
 from reference.refined_cages import tagged
 
 # Of the size of the box around the points. With no noise, only the regularizer is in the way.

@@ -7,10 +7,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage.named_cages import cube, torus
+from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.fit import LargeSteps, regularizer
 from mitsuba_subdivision.fit.smoothness import LEAST_COSINE, folds, quadratic_form
+from patches.closed_cages import torus
 
 # Of sums of float32 numbers.
 ROUNDING = 1e-6

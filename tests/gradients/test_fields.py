@@ -11,6 +11,8 @@ if __name__ == "__main__":
     import quick_kernels  # noqa: F401 - before drjit, as it chooses the LLVM library
 
 # Before Mitsuba, for an LLVM library that works.
+from patches.closed_cages import extraordinary_triangles
+
 import mitsuba_subdivision as msub  # isort: skip
 import drjit as dr
 import mitsuba as mi
@@ -43,7 +45,7 @@ FIELDS = ("t", "p", "n", "sh_frame.n", "uv", "dp_du", "dp_dv", "dn_du", "dn_dv")
 
 def cage_of(scheme):
     """With texture coordinates on the surface, and heights."""
-    cage = named_cages.extraordinary_triangles(5) if scheme == "loop" else named_cages.cube()
+    cage = extraordinary_triangles(5) if scheme == "loop" else named_cages.cube()
     x, y, z = cage.positions.T
     texcoords = np.stack([0.3 * x + 0.11 * z, 0.3 * y + 0.23 * z], axis=1)
     height = Attribute((0.2 + 0.1 * x * y - 0.05 * z)[:, None])

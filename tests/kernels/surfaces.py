@@ -8,9 +8,17 @@ from types import SimpleNamespace
 import drjit as dr
 import numpy as np
 from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary, extraordinary_face, extraordinary_triangles
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.device_arrays import upload
-from patches.closed_cages import bumpy, cage_of, mixed_torus, trapezohedron, triangulated
+from patches.closed_cages import (
+    bumpy,
+    cage_of,
+    extraordinary_face,
+    extraordinary_triangles,
+    mixed_torus,
+    trapezohedron,
+    triangulated,
+)
 from peers.fidelity_cages import book
 from reference.refined_cages import half_disc, sheet, spokes, tagged, upper_half
 

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from kernels.surfaces import aimed, computed, hit, kernel_named, random_locations, surface_named, vectors
 from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary_triangles
+from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels import line_intersection
 from mitsuba_subdivision.kernels.algebra import STEP_TOLERANCE
 from mitsuba_subdivision.kernels.line_intersection import ON_LINE, ON_NORMAL, piece_hits
 from mitsuba_subdivision.kernels.piece_kernel import PieceKernel
-from patches.closed_cages import bumpy
+from patches.closed_cages import bumpy, extraordinary_triangles
 
 pytestmark = pytest.mark.usefixtures("llvm")
 

@@ -22,7 +22,7 @@ from kernels.surfaces import (
     vectors,
 )
 from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary, tetrahedron, torus
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
 from mitsuba_subdivision.evaluation.tree_arrays import PIECE_LEVELS
@@ -30,7 +30,7 @@ from mitsuba_subdivision.kernels.algebra import AffineMap
 from mitsuba_subdivision.kernels.surface_kernel import SurfaceKernel
 from mitsuba_subdivision.patches import PieceTable
 from mitsuba_subdivision.schemes import CatmullClark
-from patches.closed_cages import bumpy
+from patches.closed_cages import bumpy, tetrahedron, torus
 from reference.refined_cages import half_disc, refine_first
 
 pytestmark = pytest.mark.usefixtures("llvm")

@@ -12,7 +12,7 @@ from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels import VertexKernel
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
 from mitsuba_subdivision.kernels.vertex_kernel import UnitNormal
-from patches.closed_cages import bumpy, mixed_torus
+from patches.closed_cages import bumpy, mixed_torus, torus
 from reference.refined_cages import refine_first, tagged
 
 CREASED = tagged(named_cages.cube(), creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)])
@@ -20,8 +20,8 @@ CASES = {
     "cube": lambda: LimitSurface(named_cages.cube()),
     "large valence": lambda: LimitSurface(named_cages.extraordinary(12, closed=False)),
     # Regular patches only.
-    "torus": lambda: LimitSurface(bumpy(named_cages.torus(5, 4))),
-    "doo_sabin": lambda: LimitSurface(bumpy(named_cages.torus(5, 4)), "doo_sabin"),
+    "torus": lambda: LimitSurface(bumpy(torus(5, 4))),
+    "doo_sabin": lambda: LimitSurface(bumpy(torus(5, 4)), "doo_sabin"),
     # Vertices on creases have copies.
     "creased": lambda: LimitSurface(CREASED),
     "refined once": lambda: LimitSurface(bumpy(mixed_torus(), size=0.05)),

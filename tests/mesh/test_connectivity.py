@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage
 from mitsuba_subdivision.cage import CageError
-from mitsuba_subdivision.cage.named_cages import cube, torus
+from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.mesh.connectivity import paired
 from mitsuba_subdivision.refinement.refined_corners import differences
+from patches.closed_cages import torus
 from reference.exact_samples import mesh_of
 
 pytestmark = pytest.mark.core

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from fuzz import topologies
 from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage
-from mitsuba_subdivision.cage.named_cages import cube, tetrahedron, torus
+from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.mesh import manifold
 from mitsuba_subdivision.mesh.connectivity import VertexRule
+from patches.closed_cages import tetrahedron, torus
 from peers import fidelity_cages
 from peers.fidelity_cages import book, fan, joined, strip
 from reference.exact_samples import faces_of, mesh_of

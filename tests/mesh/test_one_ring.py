@@ -1,10 +1,9 @@
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage.named_cages import torus
 from mitsuba_subdivision.mesh import ragged
 from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import Fan, Signature, signature_at
-from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, polygons
+from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, polygons, torus
 from reference.exact_samples import mesh_of
 from reference.refined_cages import sheet, tagged
 

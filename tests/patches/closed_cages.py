@@ -3,7 +3,80 @@
 from itertools import pairwise
 
 import numpy as np
-from mitsuba_subdivision.cage import ControlCage, named_cages
+from mitsuba_subdivision.cage import CageSource, ControlCage, named_cages
+
+
+def torus(columns, rows, major_radius=2.0, minor_radius=1.0):
+    """Torus about the z axis, of quads around vertices of valence 4.
+
+    Vertex and face (column, row) have the index ``column * rows + row``. The first edge of face (0, 0) runs from vertex
+    0, which is on the x axis, to vertex (1, 0).
+    """
+    column, row = np.indices((columns, rows)).reshape(2, -1)
+    around_axis, around_tube = 2 * np.pi * column / columns, 2 * np.pi * row / rows
+    radius = major_radius + minor_radius * np.cos(around_tube)
+    height = minor_radius * np.sin(around_tube)
+    positions = np.stack([radius * np.cos(around_axis), radius * np.sin(around_axis), height], axis=1)
+    next_column, next_row = (column + 1) % columns, (row + 1) % rows
+    corners = [(column, row), (next_column, row), (next_column, next_row), (column, next_row)]
+    faces = np.stack([c * rows + r for c, r in corners], axis=1)
+    return ControlCage(positions, faces, source=CageSource("torus"))
+
+
+def tetrahedron():
+    """Regular tetrahedron on four corners of the cube."""
+    positions = [[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]]
+    faces = [[0, 1, 3], [0, 2, 1], [0, 3, 2], [1, 2, 3]]
+    return ControlCage(positions, faces, source=CageSource("tetrahedron"))
+
+
+def extraordinary_triangles(valence, rows=4):
+    """Ball of triangles, a double pyramid, with poles of this valence, isolated with 4 rows or more.
+
+    Vertex 0 is the pole at (0, 0, 1). Faces 0 to ``valence - 1`` are its one-ring, counter-clockwise, and each begins
+    at it. The corners of the pyramids' polygon have valence 4, all other vertices 6.
+    """
+    # Circle r of the upper half has r vertices per sector; circle 0 is the pole. Triangles are sorted by circle, so
+    # that those of the pole come first.
+    circle, sector, step = np.indices((rows, valence, rows)).reshape(3, -1)
+    inner, outer = sector * circle + step, sector * (circle + 1) + step
+    up = np.array([(circle, inner), (circle + 1, outer), (circle + 1, outer + 1)])
+    down = np.array([(circle, inner), (circle + 1, outer + 1), (circle, inner + 1)])
+    corners = np.concatenate([up[..., step <= circle], down[..., step < circle]], axis=2)
+    around = corners[:, 1] % np.maximum(valence * corners[:, 0], 1)
+    vertices, number = np.unique(valence * rows * corners[:, 0] + around, return_inverse=True)
+    faces = number.reshape(3, -1).T
+
+    circle, around = np.divmod(vertices, valence * rows)
+    # Interpolate along the sector's side of the polygon, then project to the sphere.
+    side, along = np.divmod(around, np.maximum(circle, 1))
+    angle = 2 * np.pi / valence * np.stack([side, side + 1])
+    weight = np.stack([1 - along / np.maximum(circle, 1), along / np.maximum(circle, 1)])
+    flat = np.stack([(weight * np.cos(angle)).sum(axis=0), (weight * np.sin(angle)).sum(axis=0)], axis=1)
+    radius = np.sin(np.pi / 2 * circle / rows)[:, None]
+    ring = radius * flat / np.linalg.norm(flat, axis=1, keepdims=True)
+    upper = np.concatenate([ring, np.sqrt(1 - radius**2)], axis=1)
+    # The equator is shared; the lower half has mirrored copies of the other vertices.
+    below = len(upper) - valence * rows
+    lower_number = np.concatenate([len(upper) + np.arange(below), np.arange(below, len(upper))])
+    return ControlCage(
+        np.concatenate([upper, upper[:below] * [1, 1, -1]]),
+        np.concatenate([faces, lower_number[faces[:, ::-1]]]),
+        source=CageSource(f"extraordinary_triangles({valence})"),
+    )
+
+
+def extraordinary_face(corners):
+    """Ball with a face of any size on top, face 0, amid quads; all vertices have valence 4. Dual of `extraordinary`."""
+    cage = named_cages.extraordinary(corners)
+    offsets, half_edges = cage.topology.vertex_fans
+    centres = cage.positions[cage.face_vertices.reshape(-1, 4)].mean(axis=1)
+    return ControlCage.from_arrays(
+        centres / np.linalg.norm(centres, axis=1, keepdims=True),
+        np.diff(offsets),
+        cage.topology.face[half_edges],
+        source=CageSource(f"extraordinary_face({corners})"),
+    )
 
 
 def circle(n, radius, height, shift=0.0):
@@ -55,8 +128,8 @@ def cube_with_hexagon():
 def mixed_torus():
     """Torus of quads with a hexagon, a pentagon and two triangles, so large that one-rings never meet themselves."""
     rows = 8
-    torus = named_cages.torus(9, rows)
-    faces = {divmod(f, rows): tuple(face) for f, face in enumerate(torus.face_vertices.reshape(-1, 4).tolist())}
+    base = torus(9, rows)
+    faces = {divmod(f, rows): tuple(face) for f, face in enumerate(base.face_vertices.reshape(-1, 4).tolist())}
 
     a, b, c, f = faces.pop((1, 1))
     _, d, e, _ = faces.pop((2, 1))
@@ -66,14 +139,14 @@ def mixed_torus():
     a, b, c, d = faces.pop((6, 5))
     _, e, f, _ = faces.pop((7, 5))
     others += [(a, b, d), (b, e, f, c, d)]
-    return ControlCage(torus.positions, [*others, *faces.values()])
+    return ControlCage(base.positions, [*others, *faces.values()])
 
 
 CLOSED_CAGES = {
     "cube": named_cages.cube,
-    "tetrahedron": named_cages.tetrahedron,
-    "torus": lambda: named_cages.torus(5, 4),
-    "torus 3 x 3": lambda: named_cages.torus(3, 3),
+    "tetrahedron": tetrahedron,
+    "torus": lambda: torus(5, 4),
+    "torus 3 x 3": lambda: torus(3, 3),
     "prism": prism,
     "bipyramid": bipyramid,
     "trapezohedron": trapezohedron,
@@ -92,10 +165,10 @@ def triangulated(cage):
 
 
 TRIANGLE_CAGES = {
-    "tetrahedron": named_cages.tetrahedron,
+    "tetrahedron": tetrahedron,
     "bipyramid": bipyramid,
     "cube": lambda: triangulated(named_cages.cube()),
-    "torus": lambda: triangulated(named_cages.torus(5, 4)),
+    "torus": lambda: triangulated(torus(5, 4)),
     "mixed torus": lambda: triangulated(mixed_torus()),
 }
 # Scheme and cage, wherever the scheme takes the cage.

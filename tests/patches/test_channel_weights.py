@@ -7,7 +7,7 @@ from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.contents import Attribute
 from mitsuba_subdivision.patches import Channel, channel
-from patches.closed_cages import mixed_torus
+from patches.closed_cages import mixed_torus, tetrahedron, torus
 from reference.refined_cages import refine_first, tagged
 
 # Sums of some tens of terms of order one, in double precision.
@@ -33,7 +33,7 @@ CAGES = {
     "polygons": (mixed_torus, {}),
     "linear": (mixed_torus, {"face_varying": "all"}),
     "boundary": (lambda: named_cages.extraordinary(7, closed=False), {}),
-    "triangles": (named_cages.tetrahedron, {}),
+    "triangles": (tetrahedron, {}),
 }
 
 
@@ -56,7 +56,7 @@ def test_values_are_weights_times_the_cages(name, refines, np_rng, monkeypatch):
 
 
 def test_values_of_doo_sabin_are_weights_times_the_cages(np_rng):
-    cage = named_cages.torus(5, 4)
+    cage = torus(5, 4)
     surface = LimitSurface(tagged(cage, attributes={"heat": np_rng.random((cage.vertex_count, 1))}), "doo_sabin")
     channel, locations = surface.channel("heat"), grid_locations(surface, 3)
     weights = channel.weights(*locations)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
-from patches.closed_cages import bumpy, cage_of, mixed_torus
+from patches.closed_cages import bumpy, cage_of, mixed_torus, torus
 from peers.fidelity_cages import SURFACES
 from peers.test_fidelity import surface_of
 from reference.refined_cages import refine_first, sheet
@@ -76,7 +76,7 @@ def test_energies_do_not_depend_on_which_control_points_describe_the_surface(sur
 
 
 def test_bending_is_the_integral_of_both_curvatures_squared():
-    surface = LimitSurface(bumpy(named_cages.torus(7, 6)))
+    surface = LimitSurface(bumpy(torus(7, 6)))
     uv, weights = surface.scheme.domain.quadrature(ORDER)
     count = surface.cage.face_count
     samples = surface.evaluate(np.repeat(np.arange(count), len(uv)), np.tile(uv, (count, 1)), derivatives=2)

@@ -6,8 +6,9 @@ from functools import lru_cache
 
 import numpy as np
 from mitsuba_subdivision import ControlCage
-from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_face, extraordinary_triangles, torus
+from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.mesh.connectivity import Topology
+from patches.closed_cages import extraordinary_face, extraordinary_triangles, torus
 
 from reference.brute_force import BruteForce, Sample
 from reference.decimals import precision

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage.named_cages import torus
-from patches.closed_cages import bipyramid, bumpy, polygons, prism, trapezohedron, triangulated
+from patches.closed_cages import bipyramid, bumpy, polygons, prism, torus, trapezohedron, triangulated
 
 from reference.brute_force import BruteForce, ring
 from reference.decimals import precision

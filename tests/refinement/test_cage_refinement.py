@@ -10,7 +10,7 @@ from mitsuba_subdivision import Attribute, CageError, ControlCage, LimitSurface,
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.schemes import Loop
 from patches.closed_cages import SURFACES as CLOSED
-from patches.closed_cages import bumpy, cage_of, mixed_torus
+from patches.closed_cages import bumpy, cage_of, mixed_torus, tetrahedron
 from peers.fidelity_cages import ISLANDS, SURFACES, fan, with_islands
 from peers.test_fidelity import surface_of
 from reference.refined_cages import sheet, tagged, with_bumps
@@ -130,7 +130,7 @@ def test_vertices_keep_their_numbers_and_faces_know_where_they_lie():
     np.testing.assert_array_equal(fine.face_vertices[::4], t.face_vertices)
     np.testing.assert_array_equal(refinement.element, t.face)
     np.testing.assert_array_equal(t.face_offsets[refinement.element] + refinement.corner, np.arange(len(t.face)))
-    triangles = named_cages.tetrahedron().refinement("loop")
+    triangles = tetrahedron().refinement("loop")
     np.testing.assert_array_equal(np.bincount(triangles.element), 4)
     assert (triangles.corner == -1).sum() == 4
 
@@ -236,7 +236,7 @@ def test_a_scheme_with_numbers_of_its_own_is_an_error():
             return type(refinement)(turned, refinement.stencils)
 
     with pytest.raises(SchemeError, match="renumbered numbers refined faces in a way of its own"):
-        named_cages.tetrahedron().refined(Renumbered())
+        tetrahedron().refined(Renumbered())
 
 
 @pytest.mark.parametrize(

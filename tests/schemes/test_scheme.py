@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage.named_cages import tetrahedron
 from mitsuba_subdivision.schemes import SchemeError, scheme_named
 from mitsuba_subdivision.schemes.scheme import with_rules
+from patches.closed_cages import tetrahedron
 from reference.exact_samples import mesh_of
 
 pytestmark = pytest.mark.core

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import Attribute, ControlCage, LimitSurface, upload
 from mitsuba_subdivision.cage import named_cages
+from patches.closed_cages import extraordinary_triangles
 from reference.refined_cages import refine_first, tagged
 from shapes.cages import MIXED_FACES, RING, bitmap, cube, described, load, with_attributes
 from shapes.scenes import perspective, rays, scene_with
@@ -27,7 +28,7 @@ CAGES = {
     "creased": lambda: with_attributes(cube(creases=RING)),
     "valence 3": lambda: with_attributes(named_cages.extraordinary(3)),
     "mixed": lambda: with_attributes(ControlCage(cube().positions, MIXED_FACES)),
-    "loop": lambda: with_attributes(named_cages.extraordinary_triangles(5)),
+    "loop": lambda: with_attributes(extraordinary_triangles(5)),
     "doo_sabin": lambda: cube(**SMOOTH),
 }
 PLACED, VALUES = ("control_points", "to_world"), ("cage_texcoords", "cage_colour", "cage_weight", "cage_label")

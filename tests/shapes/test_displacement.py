@@ -8,6 +8,7 @@ from mitsuba_subdivision import Attribute, ControlCage, LimitSurface, upload
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.kernels.displacement import Heights
 from mitsuba_subdivision.shapes.displacement import TextureHeights
+from patches.closed_cages import extraordinary_triangles, torus
 from reference.refined_cages import tagged
 from shapes.cages import RING, bitmap, cube, load
 from shapes.scenes import all_directions, perspective, rays, scene_with, vertices, waves
@@ -59,7 +60,7 @@ CAGES = {
     "valence 5": lambda: with_heights(named_cages.extraordinary(5)),
     "dome": lambda: with_heights(named_cages.extraordinary(7, closed=False)),
     "pyramid": lambda: with_heights(pyramid(), islands=True),
-    "loop": lambda: with_heights(named_cages.extraordinary_triangles(7)),
+    "loop": lambda: with_heights(extraordinary_triangles(7)),
     "doo_sabin": lambda: with_heights(cube()),
 }
 QUADS = tuple(CAGES)[:-2]
@@ -177,7 +178,7 @@ def typical(values, expected, part):
     ("plain", "tags", "matrix", "kind"),
     [
         (cube(), {"creases": RING}, STRETCHED, "bitmap"),
-        (named_cages.torus(6, 5), {}, np.eye(4), "waves"),
+        (torus(6, 5), {}, np.eye(4), "waves"),
         (named_cages.extraordinary(5), {}, STRETCHED, "waves"),
     ],
     ids=["creases, bitmap", "torus, waves", "extraordinary, waves"],

@@ -7,6 +7,7 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, example_file, upload
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.shapes.interaction_hook import hook_problem
+from patches.closed_cages import extraordinary_triangles, tetrahedron
 from reference.refined_cages import sheet
 from scipy import ndimage
 from shapes.cages import MIXED_FACES, RING, cube, described, textured
@@ -52,9 +53,9 @@ SURFACES = {
     "mixed": (lambda: ControlCage(named_cages.cube().positions, MIXED_FACES), "catmull_clark"),
     "crease": (lambda: cube(creases=RING), "catmull_clark"),
     "semi-sharp": (lambda: cube(creases=[(a, b, 2.5) for a, b, _ in RING]), "catmull_clark"),
-    "Loop ball": (lambda: named_cages.extraordinary_triangles(8), "loop"),
+    "Loop ball": (lambda: extraordinary_triangles(8), "loop"),
     "Doo-Sabin cube": (cube, "doo_sabin"),
-    "Doo-Sabin tetrahedron": (named_cages.tetrahedron, "doo_sabin"),
+    "Doo-Sabin tetrahedron": (tetrahedron, "doo_sabin"),
 }
 EYE = (2.2, -3.2, 2.0)
 

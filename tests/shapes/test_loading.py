@@ -11,10 +11,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision import Attribute, CageWarning, ControlCage
-from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.files.formats import FORMATS
 from mitsuba_subdivision.shapes import registration, subdivision_shape
 from mitsuba_subdivision.shapes.device_state import paused_collection
+from patches.closed_cages import torus
 from reference.refined_cages import tagged
 from shapes.cages import RING, cube, described
 from shapes.updates import update
@@ -264,7 +264,7 @@ def test_shapes_of_equal_cages_share_arrays_until_those_of_one_change(shading):
 @exact
 @every_array_variant
 def test_nothing_is_kept_when_the_last_shape_has_gone():
-    shape = of(coloured(named_cages.torus(4, 3)), shading="exact")
+    shape = of(coloured(torus(4, 3)), shading="exact")
     one, two = mi.load_dict(shape), mi.load_dict(shape)
     seen = [weakref.ref(reference) for reference in tables(one)]
     del one

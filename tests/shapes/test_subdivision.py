@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import Attribute, ControlCage, LimitSurface, upload
 from mitsuba_subdivision.cage import named_cages
+from patches.closed_cages import tetrahedron
 from peers.fidelity_cages import book, fan, joined, pole
 from peers.fidelity_cages import cube as box
 from reference.bars import NORMAL_FLOAT32, NORMAL_FLOAT32_VALENCES
@@ -119,8 +120,8 @@ def test_filename_is_relative_to_the_scene_and_a_missing_file_an_error_that_name
 @scalar
 def test_a_mesh_of_a_usd_file_with_its_scheme(tmp_path):
     pytest.importorskip("pxr")
-    text, tetrahedron = "#usda 1.0\n", named_cages.tetrahedron()
-    for name, scheme, cage in (("cube", "catmullClark", cube()), ("tetrahedron", "loop", tetrahedron)):
+    text, four_sided = "#usda 1.0\n", tetrahedron()
+    for name, scheme, cage in (("cube", "catmullClark", cube()), ("tetrahedron", "loop", four_sided)):
         start, end = ([tuple(point) for point in (cage.positions + shift).tolist()] for shift in (0, [0, 0, 4]))
         text += f"""def Mesh "{name}" {{
             uniform token subdivisionScheme = "{scheme}"

@@ -5,7 +5,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, upload
-from mitsuba_subdivision.cage import named_cages
+from patches.closed_cages import extraordinary_triangles
 from reference.refined_cages import refine_first
 from shapes.cages import MIXED_FACES, cube, described, with_attributes
 from shapes.scenes import buffer, rays, scene_with, vertices
@@ -35,7 +35,7 @@ KINDS = {
     "creased": (creased, {}),
     "mixed": (mixed, {}),
     "refined": (mixed, {}),
-    "loop": (lambda: named_cages.extraordinary_triangles(5), {"scheme": "loop"}),
+    "loop": (lambda: extraordinary_triangles(5), {"scheme": "loop"}),
     "stam": (creased, {"evaluator": "stam", "sample_offset": 1e-3}),
     "attribute": (creased, BY_ATTRIBUTE),
     "bitmap": (creased, BY_BITMAP),

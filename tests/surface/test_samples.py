@@ -5,10 +5,10 @@ import pytest
 from evaluation.common import evaluate_from
 from kernels.surfaces import SURFACES, random_locations, surface_named
 from mitsuba_subdivision import Attribute, LimitSurface
-from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
+from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.patches import patch_samples
 from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
-from patches.closed_cages import bumpy, mixed_torus
+from patches.closed_cages import bumpy, extraordinary_triangles, mixed_torus
 from reference.refined_cages import refine_first, tagged
 
 pytestmark = pytest.mark.core

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.contents import Attribute
-from mitsuba_subdivision.cage.named_cages import extraordinary, extraordinary_triangles
-from patches.closed_cages import bumpy, mixed_torus
+from mitsuba_subdivision.cage.named_cages import extraordinary
+from patches.closed_cages import bumpy, extraordinary_triangles, mixed_torus
 from reference.refined_cages import tagged
 from scipy.spatial import cKDTree
 

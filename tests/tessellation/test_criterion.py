@@ -8,7 +8,7 @@ import pytest
 from kernels.surfaces import KINDS, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.errors import without_warnings
-from mitsuba_subdivision.cage.named_cages import extraordinary, torus
+from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.evaluation.polynomials import BernsteinBasis
 from mitsuba_subdivision.schemes.domain import SQUARE
 from mitsuba_subdivision.tessellation.criterion import (
@@ -20,7 +20,7 @@ from mitsuba_subdivision.tessellation.criterion import (
     Sensor,
     least_product,
 )
-from patches.closed_cages import bumpy
+from patches.closed_cages import bumpy, torus
 from reference.refined_cages import sheet
 from scipy.spatial import ConvexHull
 from tessellation.distances import distances

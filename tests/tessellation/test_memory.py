@@ -14,7 +14,7 @@ from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
 from mitsuba_subdivision.tessellation.memory import available_memory
 from mitsuba_subdivision.tessellation.uniform import uniform_table
-from patches.closed_cages import triangulated
+from patches.closed_cages import tetrahedron, torus, triangulated
 
 MEGABYTE = 1 << 20
 CHORD = Criterion(Measure.CHORD, 0.1)
@@ -69,7 +69,7 @@ def test_the_process_s_own_limit_counts(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("cage", "scheme"),
-    [(named_cages.cube(), None), (named_cages.tetrahedron(), "loop"), (named_cages.extraordinary(7), None)],
+    [(named_cages.cube(), None), (tetrahedron(), "loop"), (named_cages.extraordinary(7), None)],
 )
 def test_the_rate_that_is_offered_is_the_highest_that_fits(cage, scheme, leave, monkeypatch):
     surface = LimitSurface(cage, scheme)
@@ -164,7 +164,7 @@ def test_a_tessellation_is_shown_by_its_sizes():
 
 def test_the_coarsest_triangles_of_a_dense_cage_take_at_most_twice_the_memory_of_uniform_ones():
     """At the peak, from a cage to points, normals and triangles."""
-    cage = triangulated(named_cages.torus(100, 80))
+    cage = triangulated(torus(100, 80))
 
     def measured(make):
         tracemalloc.start()

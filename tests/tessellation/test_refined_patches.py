@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage import Attribute, named_cages
-from patches.closed_cages import bumpy, cube_with_valence_2, mixed_torus, prism
+from mitsuba_subdivision.cage import Attribute
+from patches.closed_cages import bumpy, cube_with_valence_2, mixed_torus, prism, torus
 from reference.refined_cages import refine_first
 from tessellation.test_uniform import NORMAL, ROUNDING
 
@@ -29,7 +29,7 @@ CAGES = {
     "valence 2": cube_with_valence_2(beside_triangle=True),
     "mixed torus": mixed_torus(),
     "tagged torus": tagged(mixed_torus()),
-    "tagged quads": tagged(named_cages.torus(7, 6), crease_method="chaikin"),
+    "tagged quads": tagged(torus(7, 6), crease_method="chaikin"),
 }
 
 

@@ -20,6 +20,7 @@ from mitsuba_usd.copies import LARGE, LEAST_INSTANCES, with_copies, with_large_c
 from mitsuba_usd.picture_detail import segments_of, triangles_for_picture
 from mitsuba_usd.scene_entries import DENSE, Surfaces, subdivision
 from mitsuba_usd.stage_warnings import StageWarnings
+from patches.closed_cages import torus
 from usd.stages import FOV, WIDTH, sensor_at
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
@@ -54,7 +55,7 @@ def _moved(*offset, scale=1.0):
 @pytest.mark.parametrize("shading", ["exact", "vertex"])
 @pytest.mark.parametrize("columns", [8, 20, 60])
 def test_triangles_are_as_near_as_the_picture_shows_and_not_much_nearer(columns, shading):
-    cage = named_cages.torus(columns, columns // 2)
+    cage = torus(columns, columns // 2)
     sensor = sensor_at(12.0)
     rate = _rate(_shape(cage), sensor, shading)
     surface = msub.LimitSurface(cage)
@@ -73,7 +74,7 @@ def test_triangles_are_as_near_as_the_picture_shows_and_not_much_nearer(columns,
 
 @pytest.mark.core
 def test_segments_follow_the_size_in_the_picture():
-    cage = named_cages.torus(8, 5)
+    cage = torus(8, 5)
     near, far, larger = (_rate(_shape(cage), sensor) for sensor in (sensor_at(8), sensor_at(80), sensor_at(8, 2560)))
     assert far < near < larger
     # Around the camera, a picture may show any part from near.
@@ -87,7 +88,7 @@ def test_segments_follow_the_size_in_the_picture():
 
 
 def test_the_nearest_instance_decides():
-    shape = _shape(named_cages.torus(8, 5))
+    shape = _shape(torus(8, 5))
     places = [InstanceContents(f"/{z}", 0, _moved(0, 0, z)) for z in (0, 40, 400)]
 
     def rate(instances):
@@ -97,8 +98,8 @@ def test_the_nearest_instance_decides():
 
 
 def test_still_pictures_have_adaptive_triangles_where_these_are_fewer():
-    cage, sensor = named_cages.torus(24, 16), sensor_at(5.0)
-    shape, group, dense = _shape(cage), _shape(cage, name="/group"), _shape(named_cages.torus(300, 200))
+    cage, sensor = torus(24, 16), sensor_at(5.0)
+    shape, group, dense = _shape(cage), _shape(cage, name="/group"), _shape(torus(300, 200))
     contents = SceneContents(shapes=[shape, dense], groups=[[group]], instances=[InstanceContents("/i", 0, np.eye(4))])
     segments = _segments(contents, sensor, "exact")
     triangles = _triangles(contents, sensor)
@@ -129,7 +130,7 @@ def test_rates_end_where_there_are_most_triangles(cages):
 
 def test_dense_cages_are_framed_by_points_around_the_surface():
     """None of which is far from it; unused vertices and those of holes do not count."""
-    cage = named_cages.torus(80, 40)
+    cage = torus(80, 40)
     assert cage.face_count >= DENSE
     points = np.concatenate([cage.positions, [[1e3, 0, 0]]])
     contents = replace(cage.contents, positions=points, holes=np.arange(40), scheme="catmull_clark")
