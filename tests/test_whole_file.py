@@ -205,6 +205,7 @@ import numpy as np
 from pathlib import Path
 import mitsuba_subdivision as msub
 import mitsuba as mi
+from patches.closed_cages import torus
 from mitsuba_subdivision.figures.staging import draw_picture
 from mitsuba_subdivision.figures.output import FigureOptions
 from mitsuba_subdivision.regression.image import write_exr
