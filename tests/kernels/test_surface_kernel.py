@@ -25,7 +25,7 @@ from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
-from mitsuba_subdivision.evaluation.tree_arrays import PIECE_LEVELS
+from mitsuba_subdivision.evaluation.irregular_patch import PIECE_LEVELS
 from mitsuba_subdivision.kernels.algebra import AffineMap
 from mitsuba_subdivision.kernels.surface_kernel import SurfaceKernel
 from mitsuba_subdivision.patches import PieceTable

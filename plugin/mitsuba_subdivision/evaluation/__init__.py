@@ -10,7 +10,6 @@ In the order in which they build on each other:
   subdivision matrices. Equal parts of all elements are divided once.
 - `located_samples` finds the leaves that contain samples, and the samples' weights over the one-ring. `element`
   computes points, derivatives, curvature and limit stencils from these.
-- `polynomials` converts regular patches to polynomials. `tree_arrays` does so for all pieces of a tree. `divided_tile`
-  divides tiles for bounds.
+- `polynomials` converts regular patches to polynomials. `divided_tile` divides tiles for bounds.
 - `scheme_laws` tests the laws that the rules of every scheme obey.
 """

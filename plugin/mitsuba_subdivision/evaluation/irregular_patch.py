@@ -37,6 +37,11 @@ PARALLEL = 1e-6
 # Number of levels over which `rest_rows` takes the maximum. Powers of Jordan blocks may grow at first; their
 # eigenvalues are at most a half, up to rounding, so later powers are smaller.
 GROWING_LEVELS = 16
+# Default number of levels of a tip that are stored as pieces. Their normals need no frames: derivatives become more
+# parallel at each level, but at these single precision keeps enough bits of their cross product.
+PIECE_LEVELS = 3
+# Number of regular children of a tip at each level.
+LEVEL_PIECES = 3
 # Distance from the extraordinary point, in parameters and in sizes of the patch, that single precision cannot resolve.
 FLOAT32_SIZE = 2.0**-24
 

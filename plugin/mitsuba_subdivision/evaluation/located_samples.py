@@ -25,11 +25,10 @@ from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .equations import Evaluator, SampleRows, locate, times_matrix
-from .irregular_patch import IrregularPatch, level_polynomials
+from .irregular_patch import LEVEL_PIECES, PIECE_LEVELS, IrregularPatch, level_polynomials
 from .normals import TANGENT_ROUNDING
 from .patch_tree import MOST_DEPTH, PartKind, PatchTree, Piece, divide, not_isolated
 from .polynomials import polynomial_basis
-from .tree_arrays import LEVEL_PIECES, PIECE_LEVELS
 
 # Share of the absolute terms that `frame_magnitude` counts as weight. Weights of control points are sums over
 # eigen-coordinates, whose large terms may cancel and leave rounding errors. Times `TANGENT_ROUNDING`, this share is at

@@ -7,8 +7,7 @@ consists of three regular pieces at every level (`IrregularPatch`).
 Refinement along a semi-sharp crease produces thousands of parts, but few kinds of them: parts whose one-rings have the
 same signature are divided alike. So there is one `PatchTree` for each signature, shared by all elements, and its
 children are computed on demand. Samples descend to the leaves that contain them (`located_samples`). Bounds divide
-parts whose bound is not yet tight (`divided_tile`). Kernels and integrals need all pieces (`tree_arrays`,
-`PatchTree.coefficients`).
+parts whose bound is not yet tight (`divided_tile`). Kernels and integrals need all pieces (`PatchTree.coefficients`).
 """
 
 from __future__ import annotations

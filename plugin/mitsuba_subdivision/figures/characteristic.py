@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from ..cage.named_cages import extraordinary
 from ..evaluation.element import element_stencils
-from ..evaluation.irregular_patch import IrregularPatch, level_domains, level_rows
+from ..evaluation.irregular_patch import PIECE_LEVELS, IrregularPatch, level_domains, level_rows
 from ..evaluation.patch_tree import irregular_patch, isolated_signature, patch_tree
 from ..evaluation.polynomials import polynomial_basis
-from ..evaluation.tree_arrays import PIECE_LEVELS
 from ..mesh.connectivity import Topology
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Fan, Signature

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import drjit as dr
 
+from ..evaluation.irregular_patch import LEVEL_PIECES, PIECE_LEVELS
 from ..evaluation.patch_tree import PartKind
 from ..evaluation.polynomials import polynomial_basis
-from ..evaluation.tree_arrays import LEVEL_PIECES, PIECE_LEVELS, FrameKind
 from ..patches.piece_table import (
     CODE,
     CONTROL,
@@ -31,6 +31,7 @@ from ..patches.piece_table import (
     PATCH_CORNER,
     TURN,
     WHOLE,
+    FrameKind,
 )
 from .algebra import Monomials, added, combined, cross, like, selected
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Value, Vector3
@@ -100,7 +101,7 @@ class PatchValues:
 
 
 class Tip(NamedTuple):
-    """Terms to sum at the levels of a tip that have no pieces, see `TreeArrays.blocks`."""
+    """Terms to sum at the levels of a tip that have no pieces, see `TreeArrays.weights`."""
 
     control_count: Index  # Size of the one-ring; 0 where the sample lies in a piece
     ring: Index  # First packet of the control points

@@ -68,43 +68,32 @@ class PatchTable:
     ) -> None:
         self.topology, self.scheme, self.is_hole, self.may_turn = topology, scheme, is_hole, may_turn
 
-    @cached_property
+    @property
     def elements(self) -> Topology:
         """The mesh whose faces are the elements: the cage's mesh, or its dual, whose vertices are the cage's faces.
 
         A face of the dual begins at the lowest half-edge of its vertex. Holes and border vertices, which are no
         elements, become faces without corners.
         """
-        t = self.topology
-        if self.scheme.element == "face":
-            if self._is_kept is None:
-                return t
-            kept = self.half_edge_of_corner
-            sizes = np.where(self._is_kept, t.face_sizes, 0)
-            return Topology(t.vertex_count, sizes, t.face_vertices[kept], t.edge[kept])
-        offsets, half_edges = t.vertex_fans
-        # A dual edge crosses the cage's edge that two successive faces about a vertex share.
-        return Topology(t.face_count, np.diff(offsets), t.face[half_edges], t.edge[t.prev[half_edges]])
+        return self._elements[0]
 
-    @cached_property
+    @property
     def half_edge_of_corner(self) -> IndexArray:
         """``(n_h,)`` the half-edge of the mesh that corresponds to each half-edge of `elements`."""
-        if self.scheme.element == "face":
-            if self._is_kept is not None:
-                return self.topology.half_edges_of(self._is_kept).astype(np.int32)
-            return np.arange(self.topology.half_edge_count, dtype=np.int32)
-        return self.topology.vertex_fans[1]
-
-    def half_edges(self, corners: IndexArray) -> IndexArray:
-        """`half_edge_of_corner` of the given corners."""
-        if self.elements is self.topology:
-            return corners
-        return self.half_edge_of_corner[corners]
+        return self._elements[1]
 
     @cached_property
-    def _is_kept(self) -> NDArray[np.bool_] | None:
-        """``(n_f,)`` whether each face is an element; None if all are."""
-        return None if self.is_hole is None or not self.is_hole.any() else ~self.is_hole
+    def _elements(self) -> tuple[Topology, IndexArray]:
+        t = self.topology
+        if self.scheme.element == "vertex":
+            offsets, half_edges = t.vertex_fans
+            # A dual edge crosses the cage's edge that two successive faces about a vertex share.
+            return Topology(t.face_count, np.diff(offsets), t.face[half_edges], t.edge[t.prev[half_edges]]), half_edges
+        if self.is_hole is None or not self.is_hole.any():
+            return t, np.arange(t.half_edge_count, dtype=np.int32)
+        kept = t.half_edges_of(~self.is_hole).astype(np.int32)
+        sizes = np.where(self.is_hole, 0, t.face_sizes)
+        return Topology(t.vertex_count, sizes, t.face_vertices[kept], t.edge[kept]), kept
 
     @cached_property
     def is_whole(self) -> NDArray[np.bool_]:
@@ -131,7 +120,7 @@ class PatchTable:
         order, bounds = self._order
         corners_of_class = np.split(self._patch_codes[0][order], bounds)
         signatures = [
-            signature_at(self.topology, int(self.half_edges(corners[:1])[0]), self.scheme.element)
+            signature_at(self.topology, int(self.half_edge_of_corner[corners[0]]), self.scheme.element)
             for corners in counted(corners_of_class, "Classes of patches")
         ]
         if self.scheme.has_local_borders:
@@ -144,7 +133,7 @@ class PatchTable:
         classes = []
         for signature, ring, corners, begin in zip(signatures, rings, corners_of_class, begins[:-1], strict=True):
             columns = controls[begin : begin + ring.vertex_count * len(corners)].reshape(ring.vertex_count, -1)
-            class_controls = ring.gather(self.topology, self.half_edges(corners), columns)
+            class_controls = ring.gather(self.topology, self.half_edge_of_corner[corners], columns)
             classes.append(PatchClass(signature, corners, class_controls, begin))
         return tuple(classes), controls
 
@@ -171,7 +160,7 @@ class PatchTable:
         """Patches of the cage refined once, if that leaves far fewer classes, see `RefinedPatches`; else None."""
         if self.class_count <= max(MANY_CLASSES, self.patch_count // FEW_PATCHES):
             return None
-        if self._is_kept is not None or not self.scheme.splits_corners:
+        if self.elements is not self.topology or not self.scheme.splits_corners:
             return None
         refinement = self.scheme.refine(self.topology)
         table = PatchTable(refinement.topology, self.scheme, may_turn=False)
@@ -288,8 +277,8 @@ class RefinedPatches:
 
     They serve cages of many classes: where polygons of many sizes meet vertices of many valences, nearly every patch
     may be the only one of its class, and the stencils of a class take milliseconds. In the refined cage, an old vertex
-    has only new neighbours, which are of few kinds, so that few classes are left. Normals in
-    float32 are 2 to 5 times less exact, as the refined cage's vertices are rounded.
+    has only new neighbours, which are of few kinds, so that few classes are left. Normals in float32 are 2 to 5 times
+    less exact, as the refined cage's vertices are rounded.
     """
 
     table: PatchTable  # Of the refined cage, whose faces are all elements, and whole

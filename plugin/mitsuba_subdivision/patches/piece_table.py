@@ -1,21 +1,37 @@
-"""The pieces of all patches as flat arrays for kernels: lookup tables, and weights that give their coefficients."""
+"""The pieces of all patches as flat arrays for kernels: lookup tables, and weights that give their coefficients.
+
+The samples of a kernel are unknown before it runs. So elements are divided completely (`patch_trees`). Each node is an
+inner node, with four children or one; a regular piece; or a tip, the patch around an extraordinary point.
+
+A regular piece is a polynomial, whose coefficients are weights times the control points of the element's one-ring. So
+is each of the three regular children at the first levels of a tip. These coefficients are computed once for the control
+points, and suffice for nearly all samples: after three levels a 64th of a tip's domain is left.
+
+Deeper levels use equations (10) and (12) as a table. A *block* has a row for each control point of the one-ring, and a
+column for each monomial of the scheme's `PolynomialBasis`. The sum of rows times control points, relative to the first
+control point, gives coefficients. The first eigenvector, which is constant, contributes only to the point itself.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from enum import IntEnum
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from ..evaluation.patch_tree import PartKind, patch_trees
+from ..evaluation.irregular_patch import LEVEL_PIECES, PIECE_LEVELS, IrregularPatch, float32_levels, level_polynomials
+from ..evaluation.patch_tree import PartKind, PatchTree, patch_trees
 from ..evaluation.polynomials import polynomial_basis
-from ..evaluation.tree_arrays import LEVEL_PIECES, PIECE_LEVELS, TreeArrays, tree_arrays
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared
+from ..mesh.signature import Signature
 from ..messages import counted
 from ..schemes.domain import FloatArray
+from ..schemes.scheme import Scheme
 from .patch_table import PatchTable
 
 if TYPE_CHECKING:
@@ -36,6 +52,46 @@ KINDS, TURN = 3, 4
 FRAMES, LEVEL, LEVELS, CONTROL = 3, 4, 1023, 4096
 # Most bytes of coefficients, in single precision, of the levels of tips that are stored as pieces.
 COEFFICIENT_BYTES = 1 << 26
+# Maximum number of pieces of a part whose coefficients are stored as a whole. Larger elements are split into parts:
+# along semi-sharp creases there are thousands of parts of few kinds, which share coefficients.
+SHARED_PIECES = 64
+
+
+class FrameKind(IntEnum):
+    """Where the normals of a tip need a frame in place of the derivatives."""
+
+    DERIVATIVES = 0  # Nowhere
+    AT_POINT = 1  # At the extraordinary point
+    UNEVEN = 2  # At all deeper levels: `uneven_frame`
+
+
+class PieceMap(NamedTuple):
+    """Map from the control points of the element's one-ring to the coefficients of consecutive pieces."""
+
+    first_piece: int
+    # (K_part, K) float64: stencils of the control points of a part's one-ring, so that equal parts of many elements
+    # share ``pieces``. None if ``pieces`` are over the element's one-ring.
+    stencils: FloatArray | None
+    pieces: FloatArray  # (p, m, K_part) float64: coefficients of the pieces' polynomials over control points
+
+
+@dataclass(frozen=True, eq=False)
+class TreeArrays:
+    """Nodes, pieces and blocks of a patch tree, with indices that begin at 0."""
+
+    # (n, 4) int64; the first node is the element. `PartKind` plus `TURN` times `PatchTree.turn`; index of the first of
+    # consecutive children, or for a leaf of its first piece, as the pieces of a tip are consecutive, level by level;
+    # row of `weights` at which a tip's blocks begin; `FrameKind` of a tip plus `LEVEL` times the number of its levels,
+    # after which its rest begins, plus `CONTROL` times the number of control points in the one-ring
+    nodes: IntArray
+    piece_count: int
+    maps: tuple[PieceMap, ...]  # Maps to the coefficients of all pieces
+    # (b K, m) float64: blocks of tips. For each tip: one for each regular child of each deeper level; one for the rest,
+    # linear with the tangents along the edges; one whose derivatives are the frame of (13). If the frame is uneven,
+    # another one for each regular child of each deeper level: the point without the second eigenvector, divided by the
+    # power of the third eigenvalue. Row 0 of a block has no weights, as the first control point, relative to itself, is
+    # zero. In uneven tips row 0 is the polynomial of the second eigenvector, for `uneven_frame`.
+    weights: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +113,7 @@ class PieceTable:
     patch_starts: NDArray[np.uint32]  # (p, 2) uint32: first piece and first node of each patch
     # (p,) uint32: first packet of the control points of each patch; any number for patches without tips
     rings: NDArray[np.uint32]
-    # (n, 4) uint32: `TreeArrays.kinds` plus `TURN` times the turn; index of the first child, or of the piece, counted
-    # from the patch's first piece; row of `weights` at which a tip's blocks begin; `TreeArrays.frames` plus `LEVEL`
-    # times the levels plus `CONTROL` times the number of control points in the one-ring
-    nodes: NDArray[np.uint32]
+    nodes: NDArray[np.uint32]  # (n, 4) uint32: `TreeArrays.nodes` of all classes, counted through all of them
     trees: tuple[TreeArrays, ...]  # Of each class
     # (c, 7) uint32, for each class: index of its first entry in `controls`; number of patches, and of controls per
     # patch; first piece; number of pieces per patch; first packet of control points; number of these per patch
@@ -100,13 +153,17 @@ class PieceTable:
         signatures = counted([kind.signature for kind in table.classes], "Pieces of patch classes")
         trees = tuple(tree_arrays(table.scheme, signature, piece_levels) for signature in signatures)
         sizes = np.array([tree.piece_count for tree in trees])
-        rings = np.where([len(tree.blocks) > 0 for tree in trees], control_counts, 0)
+        rings = np.where([len(tree.weights) > 0 for tree in trees], control_counts, 0)
         first_pieces, piece_count = ragged.starts(sizes * counts), int(sizes @ counts)
         first_rings = packets_of_piece * piece_count + ragged.starts(rings * counts)
         packet_count = packets_of_piece * piece_count + int(rings @ counts)
         first_controls = [kind.first_control for kind in table.classes]
         columns = first_controls, counts, control_counts, first_pieces, sizes, first_rings, rings
-        first_nodes = ragged.starts(np.array([len(tree.kinds) for tree in trees]))
+        node_counts, weight_counts = np.array([(len(tree.nodes), len(tree.weights)) for tree in trees]).T
+        first_nodes, nodes = ragged.starts(node_counts), np.concatenate([tree.nodes for tree in trees])
+        is_inner = nodes[:, 0] & KINDS <= PartKind.ONLY_CHILD
+        nodes[:, 1] += is_inner * np.repeat(first_nodes, node_counts)
+        nodes[:, 2] += np.repeat(ragged.starts(weight_counts), node_counts)
         in_class = ragged.index_in_row(counts)
         starts = np.repeat(first_pieces, counts) + np.repeat(sizes, counts) * in_class, np.repeat(first_nodes, counts)
         return cls(
@@ -117,18 +174,18 @@ class PieceTable:
             packet_count + -packet_count % packets_of_piece,
             np.stack(starts, axis=1).astype(np.uint32),
             (np.repeat(first_rings, counts) + np.repeat(rings, counts) * in_class).astype(np.uint32),
-            _joined_nodes(trees, control_counts.tolist()),
+            nodes.astype(np.uint32),
             trees,
             np.stack(columns, axis=1).astype(np.uint32),
             *patches.control_rows(control_of_vertex, control_count),
         )
 
     def weights(self, size: int, dtype: DTypeLike = np.float64) -> FloatArray:
-        """``(w, size)`` blocks of all classes, one row for each control point, padded with zeros.
+        """``(w, size)`` `TreeArrays.weights` of all classes, padded with zeros.
 
         Computed at each call, as kernels keep the result.
         """
-        rows = np.concatenate([tree.blocks.reshape(-1, tree.blocks.shape[2]) for tree in self.trees], dtype=dtype)
+        rows = np.concatenate([tree.weights for tree in self.trees], dtype=dtype)
         return np.pad(rows, ((0, 0), (0, size - rows.shape[1])))
 
     @property
@@ -166,14 +223,84 @@ def piece_packets(monomial_count: int) -> int:
     return -(-3 * monomial_count // PACKET)
 
 
-def _joined_nodes(trees: tuple[TreeArrays, ...], control_counts: list[int]) -> NDArray[np.uint32]:
-    """`PieceTable.nodes`."""
-    nodes, first_node, first_row = [], 0, 0
-    for tree, control_count in zip(trees, control_counts, strict=True):
-        first = np.where(tree.kinds >= PartKind.REGULAR, tree.first, tree.first + first_node)
-        ends = tree.frames + LEVEL * tree.levels + CONTROL * control_count
-        rows = first_row + tree.first_block * control_count
-        nodes.append(np.stack([tree.kinds + TURN * tree.turns, first, rows, ends], axis=1))
-        first_node += len(tree.kinds)
-        first_row += len(tree.blocks) * control_count
-    return np.concatenate(nodes).astype(np.uint32)
+# A tree takes up to some megabytes at high valences.
+@lru_cache(maxsize=128)
+def tree_arrays(
+    scheme: Scheme,
+    signature: Signature,
+    piece_levels: int = PIECE_LEVELS,  # Number of levels of a tip that are pieces; the others are blocks
+) -> TreeArrays:
+    """Return the arrays of the patch tree of a signature."""
+    (element,) = patch_trees(scheme, [signature])
+    kinds, turns, first = element.nodes.T.copy()
+    # Regular pieces come before those of tips.
+    maps, piece_count = [], 0
+    for part, stencils in _shared_parts(element):
+        pieces = _regular_pieces(scheme, part)
+        maps.append(PieceMap(piece_count, stencils, pieces))
+        piece_count += len(pieces)
+    row, end = np.zeros(len(first), dtype=np.int64), np.full(len(first), CONTROL * element.control_count)
+    weights: list[FloatArray] = [np.empty((0, len(polynomial_basis(scheme).powers)))]
+    row_count = 0
+    # In nodes of tips, `first` is the index in `PatchTree.tips`.
+    tip_nodes = np.flatnonzero(kinds == PartKind.TIP)
+    for node, piece in zip(tip_nodes[np.argsort(first[tip_nodes])].tolist(), element.tips, strict=True):
+        tip_pieces, tip_blocks, first_rows, frame, level_count = _tip(scheme, piece.irregular_patch, piece_levels)
+        first[node], row[node] = piece_count, row_count
+        end[node] += frame + LEVEL * level_count
+        maps.append(PieceMap(piece_count, None, tip_pieces @ piece.coordinates))
+        blocks = (tip_blocks @ piece.coordinates).swapaxes(1, 2).copy()
+        blocks[: len(first_rows), 0] = first_rows
+        weights.append(blocks.reshape(-1, blocks.shape[2]))
+        piece_count, row_count = piece_count + len(tip_pieces), row_count + len(weights[-1])
+    nodes = np.stack([kinds + TURN * turns, first, row, end], axis=1)
+    maps = [piece_map for piece_map in maps if len(piece_map.pieces)]
+    return TreeArrays(nodes, piece_count, tuple(maps), np.concatenate(weights))
+
+
+# A tip takes some megabytes at high valences.
+@lru_cache(maxsize=16)
+def _tip(
+    scheme: Scheme, patch: IrregularPatch, piece_levels: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FrameKind, int]:
+    """Return polynomials of a tip over the eigen-coordinates.
+
+    Returns those of the pieces ``(n, m, K)``; the blocks ``(b, m, K)``; row 0 of the first l blocks ``(l, m)``, see
+    `TreeArrays.weights`; the kind of frame; and the number of levels.
+    """
+    basis, polynomials, level_count = patch.basis, polynomial_basis(scheme), float32_levels(patch)
+    by_level = level_polynomials(patch, polynomials.matrix, np.arange(level_count))
+    shape = -1, *by_level.shape[2:]
+    deeper = by_level[piece_levels:]
+    rest: FloatArray = np.zeros((2, *shape[1:]))
+    u, v = (int(np.flatnonzero((polynomials.powers == power).all(axis=1))[0]) for power in ((1, 0), (0, 1)))
+    rest[0, [u, v]], rest[1, [u, v]] = basis.subdominant**level_count * patch.edge_tangents, patch.limit_frame
+    # Polynomials are about the middle of the domain, and the extraordinary point is at its corner.
+    rest[0, 0] = polynomials.centre @ rest[0, [u, v]]
+    rest[0, 0, 0] = 1
+    blocks, second_eigenvector = [deeper.reshape(shape), rest], 0 * by_level[0, :, :, 0]
+    frame = FrameKind.AT_POINT if patch.has_own_frame else FrameKind.DERIVATIVES
+    if patch.contracts_unevenly:
+        across = deeper / basis.moduli[2] ** np.arange(piece_levels, level_count)[:, None, None, None]
+        across[..., :2] = 0
+        blocks.append(across.reshape(shape))
+        frame, second_eigenvector = FrameKind.UNEVEN, by_level[0, :, :, 1]
+    second_eigenvector = np.tile(second_eigenvector, (len(deeper), 1))
+    return by_level[:piece_levels].reshape(shape), np.concatenate(blocks), second_eigenvector, frame, level_count
+
+
+def _shared_parts(element: PatchTree) -> list[tuple[PatchTree, FloatArray | None]]:
+    """Return the largest parts with at most `SHARED_PIECES` pieces, and their stencils; None for the whole element."""
+    if element.piece is not None or element.regular_count <= SHARED_PIECES:
+        return [(element, None)]
+    return [
+        (part, child_stencils if stencils is None else stencils @ child_stencils)
+        for child, child_stencils in element.children
+        for part, stencils in _shared_parts(child)
+    ]
+
+
+@lru_cache(maxsize=1024)
+def _regular_pieces(scheme: Scheme, element: PatchTree) -> FloatArray:
+    """Return ``(p, m, K)`` coefficients of an element's regular pieces."""
+    return element.coefficients(polynomial_basis(scheme).matrix)
