@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
@@ -154,15 +154,9 @@ class TileRates:
             is_flat[inner] = (normals.sine < 1) & (extent[inner] <= coarse_limit - height_range[inner])
         for side, (begin, end) in enumerate(zip(corners, np.roll(corners, -1, axis=0), strict=True)):
             featured = np.flatnonzero(is_flat & ~fits & (tiles["sides"][:, side] > 0))
-            side_hull = kind.side_hulls[side] if len(featured) else None
-            if side_hull is None:
-                is_flat[featured] = False
-            else:
-                curve, across = (
-                    times(side_hull, values[..., featured]),
-                    _normals_to(end[:, featured] - begin[:, featured]),
-                )
-                width = np.hypot(*(np.ptp(dot(curve, direction), axis=0) for direction in across))
+            if len(featured):
+                across = _normals_to(end[:, featured] - begin[:, featured])
+                width = _extent(kind.side_hulls[side], values[..., featured], across)
                 is_flat[featured] = width <= limit[featured]
         return is_flat
 
@@ -209,8 +203,8 @@ class TileRates:
         return heights
 
 
-def _extent(hull: FloatArray | None, values: FloatArray, axes: FloatArray) -> FloatArray:
-    """``(t,)`` sizes of hulls of tiles along axes ``(d, 3, t)``; infinite for unknown hulls."""
+def _extent(hull: FloatArray | None, values: FloatArray, axes: Iterable[FloatArray]) -> FloatArray:
+    """``(t,)`` sizes of hulls of tiles along orthogonal axes ``(3, t)``; infinite for unknown hulls."""
     if hull is None:
         return np.full(values.shape[2], np.inf)
     extent: FloatArray = np.linalg.norm([np.ptp(times(hull, dot(values, axis)), axis=0) for axis in axes], axis=0)
