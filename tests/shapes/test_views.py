@@ -12,7 +12,7 @@ from mitsuba_subdivision import CageWarning, ControlCage
 from shapes.cages import ISLANDS, MIXED_FACES, RING, bitmap, cube, described, load, with_attributes
 from shapes.scenes import buffer, perspective, scene_with
 from shapes.updates import derivative, differentiated, update
-from shapes.variants import every_ad_variant, exact
+from shapes.variants import every_ad_variant, exact, shadings
 
 pytestmark = every_ad_variant
 
@@ -20,12 +20,8 @@ KEY = "shape.control_points"
 VIEWS = 2
 # Sums of the same terms of float32 in another order.
 ROUNDING = 1e-5
-# Cubes whose vertices have copies: for normals along a crease, and for texture coordinates along seams.
-SEAMED = {
-    "seams": cube(texcoords=ISLANDS),
-    "crease": cube(creases=RING),
-    "both": cube(texcoords=ISLANDS, creases=RING),
-}
+# A cube whose vertices have copies: for normals along a crease, and for texture coordinates along seams.
+SEAMED = cube(texcoords=ISLANDS, creases=RING)
 
 
 def views_of(integrator, cage=None, resolution=16, **parameters):
@@ -51,7 +47,12 @@ def gradient_by(scene, how, kept):
     parameters = mi.traverse(scene)
     if kept:
         parameters.keep([KEY])
-    points = differentiated(parameters, KEY)
+    if how == "optimiser":
+        optimiser = mi.ad.SGD(lr=1, params={KEY: dr.detach(parameters[KEY])})
+        parameters.update(optimiser)
+        points = optimiser[KEY]
+    else:
+        points = differentiated(parameters, KEY)
     if how == "sum":
         dr.backward(msub.loss_of_views(scene, parameters, loss_of, spp=4))
         return np.array(dr.grad(points))
@@ -64,12 +65,13 @@ def gradient_by(scene, how, kept):
 
 
 ONCE, SUM, KEPT_SUM, KEPT_ONCE = ("once", False), ("sum", False), ("sum", True), ("once", True)
+OPTIMISER = ("optimiser", False)
 
 
 @pytest.mark.parametrize(
     ("integrator", "shading", "cases"),
     [
-        ("prb", "vertex", [ONCE, SUM, KEPT_SUM, KEPT_ONCE]),
+        ("prb", "vertex", [ONCE, SUM, KEPT_SUM, KEPT_ONCE, OPTIMISER]),
         ("direct_projective", "vertex", [KEPT_ONCE]),
         pytest.param("direct", "exact", [ONCE], marks=exact),
     ],
@@ -129,18 +131,6 @@ def test_gradients_of_views_are_those_of_their_sum_alone_and_together(names, par
         assert np.abs(expected).max() > 0
         tolerance = 10 * ROUNDING * np.abs(expected).max()
         np.testing.assert_allclose(np.array(dr.grad(value)).ravel(), expected, rtol=0, atol=tolerance, err_msg=key)
-
-
-def test_an_optimiser_needs_one_update_for_all_views():
-    scene = views_of("prb")
-    parameters, gradients = mi.traverse(scene), []
-    optimiser = mi.ad.SGD(lr=1, params={KEY: parameters[KEY]})
-    parameters.update(optimiser)
-    for view in range(VIEWS):
-        dr.backward(loss_at(scene, parameters, view))
-        gradients.append(np.array(dr.grad(optimiser[KEY])))
-    np.testing.assert_allclose(gradients[-1], gradient_by(scene, "sum", kept=False), rtol=ROUNDING, atol=ROUNDING)
-    assert np.abs(gradients[1] - gradients[0]).max() > 1e-4
 
 
 def test_what_users_assign_to_vertices_stays_when_gradients_pass():
@@ -234,9 +224,8 @@ def test_derivatives_do_not_keep_shapes_alive(given, seen, shading):
 # Outlines
 
 
-@pytest.mark.parametrize("name", SEAMED)
-def test_edges_between_copies_of_vertices_are_no_outlines(name):
-    shape = load(SEAMED[name], tessellation_rate=4)
+def test_edges_between_copies_of_vertices_are_no_outlines():
+    shape = load(SEAMED, tessellation_rate=4)
     parameters, faces = mi.traverse(shape), buffer(shape, "faces").ravel()
     edges = np.arange(len(faces))
     following = edges + np.where(edges % 3 == 2, -2, 1)
@@ -254,9 +243,9 @@ def test_edges_between_copies_of_vertices_are_no_outlines(name):
 
 
 # Those of vertices along a crease are in tests/gradients/test_outlines.py.
-@pytest.mark.parametrize(("name", "shading"), [("seams", "vertex"), pytest.param("both", "exact", marks=exact)])
-def test_gradients_of_outlines_are_differences_where_vertices_have_copies(name, shading):
-    scene = views_of("direct_projective", SEAMED[name], shading=shading)
+@shadings
+def test_gradients_of_outlines_are_differences_where_vertices_have_copies(shading):
+    scene = views_of("direct_projective", SEAMED, shading=shading)
     parameters = mi.traverse(scene)
     start = mi.Float(parameters[KEY])
 
@@ -272,7 +261,7 @@ def test_gradients_of_outlines_are_differences_where_vertices_have_copies(name, 
 
 
 def test_a_user_may_assign_other_triangles():
-    shape = load(SEAMED["seams"], tessellation_rate=2)
+    shape = load(SEAMED, tessellation_rate=2)
     parameters = mi.traverse(shape)
     points, whole = differentiated(parameters, "control_points"), np.array(parameters["faces"])
     update(parameters, faces=mi.UInt32(whole[: len(whole) // 2]))
@@ -283,9 +272,8 @@ def test_a_user_may_assign_other_triangles():
     assert opposite[opposite != 2**32 - 1].max() < len(whole) // 2
 
 
-@pytest.mark.parametrize("name", ["seams", "crease"])
-def test_surface_area_keeps_derivatives(name):
-    shape, size = load(SEAMED[name], tessellation_rate=4), dr.opaque(mi.Float, 1)
+def test_surface_area_keeps_derivatives():
+    shape, size = load(SEAMED, tessellation_rate=4), dr.opaque(mi.Float, 1)
     parameters, before = mi.traverse(shape), shape.surface_area()[0]
     dr.enable_grad(size)
     update(parameters, control_points=mi.Float(parameters["control_points"]) * size)
