@@ -23,14 +23,6 @@ def differentiated(parameters, key):
     return values
 
 
-def assign_cage(shape, cage):
-    """Assign the texture coordinates and attributes of a cage."""
-    parameters = mi.traverse(shape)
-    values = {"texcoords": cage.texcoords, **cage.attributes}
-    kinds = {name: type(parameters[f"cage_{name}"]) for name in values}
-    update(parameters, {f"cage_{name}": upload(kinds[name], attribute.values) for name, attribute in values.items()})
-
-
 MODES = ("backward", "forward", "difference")
 
 
