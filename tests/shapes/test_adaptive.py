@@ -13,7 +13,7 @@ from reference.refined_cages import tagged
 from shapes.cages import cube, load
 from shapes.scenes import SINGLE, all_directions, buffer, film, perspective, rays, scene_with, vertices
 from shapes.updates import update
-from shapes.variants import every_variant, llvm, scalar, shadings
+from shapes.variants import every_variant, llvm, scalar
 from tessellation.test_attribute_table import with_seams
 
 ADAPTIVE = {"tessellation": "adaptive", "max_rate": 32}
@@ -117,13 +117,12 @@ def test_pixel_errors_are_seen_from_the_sensor(sensor):
 
 
 @llvm
-@shadings
-def test_not_one_ray_escapes(shading, np_rng):
+def test_not_one_ray_escapes(np_rng):
     """From the middle of a closed creased cage with seams and polygons."""
     cage = with_seams(bumpy(named_cages.extraordinary(7)), np_rng)
     cage = tagged(cage, texcoords=cage.texcoords, creases=cage.tags.creases(cage.topology))
     error, outwards = pixel_error_for(mi.load_dict(view((96, 96), fov=6)), 0.2), all_directions(768)
-    shape = load(cage, **error, shading=shading)
+    shape = load(cage, **error)
     assert shape.vertex_count() > 1000
     assert dr.all(scene_with(shape=shape).ray_test(rays(0 * outwards, outwards)))
 
@@ -135,8 +134,11 @@ def test_sensors_of_other_kinds_are_refused():
 
 
 @llvm
-@pytest.mark.parametrize(("count", "message"), [(21, "21 numbers; expected"), (24, "expected finite numbers")])
-@pytest.mark.parametrize("limit", [{"chord_error": 1e-1}, {}], ids=["chord_error", "None"])
+@pytest.mark.parametrize(
+    ("limit", "count", "message"),
+    [({"chord_error": 1e-1}, 21, "21 numbers; expected"), ({}, 24, "expected finite numbers")],
+    ids=["chord_error", "None"],
+)
 def test_control_points_that_are_wrong_choose_no_triangles(count, message, limit):
     shape = make(cube(), chord_error=1e-2)
     parameters, faces = mi.traverse(shape), buffer(shape, "faces")
