@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from mitsuba_subdivision import ControlCage
 from mitsuba_subdivision.cage import named_cages
+from scipy.sparse import csr_array
 
 CACHE = Path(tempfile.gettempdir()) / "mitsuba-subdivision-benchmarks"
 # Four corners of each of three golden rectangles.
@@ -44,14 +45,17 @@ def split_sphere(frequency, low, high, rounds, bump):
     points, triangles = _geodesic_sphere(frequency)
     points, triangles = _flip_edges(points, triangles, low, high, rounds)
     points = _relax(points, triangles, 10)
-    points, quads = _split(points, triangles)
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points, quads = refined(points, triangles)
+    points = points / np.linalg.norm(points, axis=1, keepdims=True)
     x, y, z = points.T
     return points * (1 + bump * np.sin(5 * x + 1) * np.sin(4 * y) + bump * np.cos(6 * z))[:, None], quads
 
 
-def refined_twice(points, quads):
-    cage = ControlCage(points, quads).refined().refined()
+def refined(points, faces, times=1):
+    """Once, each face is cut into quadrilaterals, one at each corner."""
+    cage = ControlCage(points, faces)
+    for _ in range(times):
+        cage = cage.refined()
     return cage.positions, cage.face_vertices.reshape(-1, 4)
 
 
@@ -59,7 +63,7 @@ MAKERS = {
     "cube": cube,
     "star": lambda: split_sphere(2, 3, 8, 10, 0.25),
     "ev50k": lambda: split_sphere(29, 5, 7, 8, 0.06),
-    "mix50k": lambda: refined_twice(*split_sphere(7, 3, 8, 8, 0.12)),
+    "mix50k": lambda: refined(*split_sphere(7, 3, 8, 8, 0.12), times=2),
     "torus": torus,
     "ev500k": lambda: split_sphere(91, 5, 7, 8, 0.06),
     "ev2m": lambda: split_sphere(183, 5, 7, 8, 0.06),
@@ -87,10 +91,6 @@ def read_bin(path):
         point_count, quad_count = np.fromfile(file, np.int32, 2)
         points = np.fromfile(file, np.float32, 3 * point_count).reshape(-1, 3)
         return points, np.fromfile(file, np.int32, 4 * quad_count).reshape(-1, 4)
-
-
-def _scattered(rows, values, count):
-    return np.stack([np.bincount(rows, weights=column, minlength=count) for column in values.T], axis=1)
 
 
 def _edges(faces, vertex_count):
@@ -158,17 +158,8 @@ def _flip_edges(points, triangles, low, high, rounds):
 def _relax(points, triangles, steps):
     """Move points towards their neighbours' middle, on the sphere."""
     start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
-    valence = np.bincount(start)[:, None]
+    neighbours = csr_array((1 / np.bincount(start)[start], (start, end)), shape=(len(points),) * 2)
     for _ in range(steps):
-        points = points + (_scattered(start, points[end], len(points)) / valence - points) / 2
+        points = (points + neighbours @ points) / 2
         points /= np.linalg.norm(points, axis=1, keepdims=True)
     return points
-
-
-def _split(points, triangles):
-    ends, edge = _edges(triangles, len(points))
-    edge = edge + len(points)
-    centre = len(points) + len(ends) + np.arange(len(triangles))
-    quads = [np.stack([triangles[:, k], edge[:, k], centre, edge[:, k - 1]], axis=1) for k in range(3)]
-    points = np.concatenate([points, points[ends].mean(axis=1), points[triangles].mean(axis=1)])
-    return points, np.stack(quads, axis=1).reshape(-1, 4)
