@@ -16,7 +16,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import quick_kernels  # noqa: F401, I001 - before drjit, as it chooses the LLVM library
 import drjit as dr
 import mitsuba as mi
-from patches.closed_cages import tetrahedron, torus
+from patches.closed_cages import cube_with_hexagon, tetrahedron, torus
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import ControlCage, named_cages
@@ -88,9 +88,6 @@ def np_rng():
     return np.random.default_rng(0)
 
 
-# A cube of mixed face sizes: the top is two triangles, two sides are joined to an L-shaped hexagon.
-_MIXED_FACES = [[0, 2, 3, 1], [4, 5, 7], [4, 7, 6], [3, 2, 6, 7], [0, 4, 6, 2], [1, 3, 7, 5, 4, 0]]
-
 _CAGES = {
     "cube": named_cages.cube,
     "tetrahedron": tetrahedron,
@@ -99,7 +96,7 @@ _CAGES = {
     "valence 3": lambda: named_cages.extraordinary(3),
     "valence 5": lambda: named_cages.extraordinary(5),
     "dome": lambda: named_cages.extraordinary(7, closed=False),
-    "mixed faces": lambda: ControlCage(named_cages.cube().positions, _MIXED_FACES),
+    "mixed faces": cube_with_hexagon,
     "one triangle": lambda: ControlCage(np.eye(3), [[0, 1, 2]]),
 }
 

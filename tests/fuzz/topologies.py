@@ -21,6 +21,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
 from mitsuba_subdivision.mesh.connectivity import VertexRule
+from peers.fidelity_cages import edges_of
 from reference.refined_cages import refined
 
 # Points and unit normals, of cages of a size of some units.
@@ -45,10 +46,6 @@ SEEDS = (
     [(0, 1, 4, 3), (1, 2, 5, 4), (3, 4, 7, 6), (4, 5, 8, 7)],
     [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 1), (5, 2, 1), (5, 3, 2), (5, 4, 3), (5, 1, 4)],
 )
-
-
-def edges_of(face):
-    return list(zip(face, (*face[1:], face[0]), strict=True))
 
 
 def vertices_of(faces):

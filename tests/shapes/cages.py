@@ -8,8 +8,6 @@ from reference.refined_cages import tagged
 
 # Around the top of the cube, of edges that are sharp and of semi-sharp ones.
 RING = [(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)]
-# The cube with a top of two triangles, and two sides joined to an L-shaped hexagon.
-MIXED_FACES = [[0, 2, 3, 1], [4, 5, 7], [4, 7, 6], [3, 2, 6, 7], [0, 4, 6, 2], [1, 3, 7, 5, 4, 0]]
 # Texture coordinates of the cube: each face is an island.
 ISLANDS = Attribute(np.tile([[0.0, 0], [1, 0], [1, 1], [0, 1]], (6, 1)), "face_varying")
 

@@ -4,11 +4,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import Attribute, ControlCage, LimitSurface, upload
+from mitsuba_subdivision import Attribute, LimitSurface, upload
 from mitsuba_subdivision.cage import named_cages
-from patches.closed_cages import extraordinary_triangles
+from patches.closed_cages import cube_with_hexagon, extraordinary_triangles
 from reference.refined_cages import refine_first, tagged
-from shapes.cages import MIXED_FACES, RING, bitmap, cube, described, load, with_attributes
+from shapes.cages import RING, bitmap, cube, described, load, with_attributes
 from shapes.scenes import perspective, rays, scene_with
 from shapes.updates import MODES, derivative, moving, update
 from shapes.variants import every_ad_variant, exact, llvm
@@ -27,7 +27,7 @@ CAGES = {
     "cube": lambda: with_attributes(cube()),
     "creased": lambda: with_attributes(cube(creases=RING)),
     "valence 3": lambda: with_attributes(named_cages.extraordinary(3)),
-    "mixed": lambda: with_attributes(ControlCage(cube().positions, MIXED_FACES)),
+    "mixed": lambda: with_attributes(cube_with_hexagon()),
     "loop": lambda: with_attributes(extraordinary_triangles(5)),
     "doo_sabin": lambda: cube(**SMOOTH),
 }

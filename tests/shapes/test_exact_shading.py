@@ -7,10 +7,10 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, example_file, upload
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.shapes.interaction_hook import hook_problem
-from patches.closed_cages import extraordinary_triangles, tetrahedron
+from patches.closed_cages import cube_with_hexagon, extraordinary_triangles, tetrahedron
 from reference.refined_cages import sheet
 from scipy import ndimage
-from shapes.cages import MIXED_FACES, RING, cube, described, textured
+from shapes.cages import RING, cube, described, textured
 from shapes.scenes import down, perspective, rays, rows, scene_with
 from shapes.variants import llvm
 
@@ -50,7 +50,7 @@ SURFACES = {
     "far": (lambda: cube().with_positions(cube().positions + 1000), "catmull_clark"),
     "valence 5": (lambda: named_cages.extraordinary(5), "catmull_clark"),
     "dome": (lambda: named_cages.extraordinary(7, closed=False), "catmull_clark"),
-    "mixed": (lambda: ControlCage(named_cages.cube().positions, MIXED_FACES), "catmull_clark"),
+    "mixed": (cube_with_hexagon, "catmull_clark"),
     "crease": (lambda: cube(creases=RING), "catmull_clark"),
     "semi-sharp": (lambda: cube(creases=[(a, b, 2.5) for a, b, _ in RING]), "catmull_clark"),
     "Loop ball": (lambda: extraordinary_triangles(8), "loop"),

@@ -4,10 +4,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, upload
-from patches.closed_cages import extraordinary_triangles
+from mitsuba_subdivision import upload
+from patches.closed_cages import cube_with_hexagon, extraordinary_triangles
 from reference.refined_cages import refine_first
-from shapes.cages import MIXED_FACES, cube, described, with_attributes
+from shapes.cages import cube, described, with_attributes
 from shapes.scenes import buffer, rays, scene_with, vertices
 from shapes.updates import update
 from shapes.variants import every_variant, exact, llvm, shadings
@@ -27,19 +27,15 @@ def creased():
     return cube(creases=[(0, 1, 10), (1, 3, 10), (3, 2, 2.5)])
 
 
-def mixed():
-    return ControlCage(cube().positions, MIXED_FACES)
-
-
 KINDS = {
     "creased": (creased, {}),
-    "mixed": (mixed, {}),
-    "refined": (mixed, {}),
+    "mixed": (cube_with_hexagon, {}),
+    "refined": (cube_with_hexagon, {}),
     "loop": (lambda: extraordinary_triangles(5), {"scheme": "loop"}),
     "stam": (creased, {"evaluator": "stam", "sample_offset": 1e-3}),
     "attribute": (creased, BY_ATTRIBUTE),
     "bitmap": (creased, BY_BITMAP),
-    "adaptive": (mixed, ADAPTIVE),
+    "adaptive": (cube_with_hexagon, ADAPTIVE),
     "adaptive bitmap": (creased, ADAPTIVE | BY_BITMAP),
 }
 

@@ -8,8 +8,9 @@ import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest
-from mitsuba_subdivision import CageWarning, ControlCage
-from shapes.cages import ISLANDS, MIXED_FACES, RING, bitmap, cube, described, load, with_attributes
+from mitsuba_subdivision import CageWarning
+from patches.closed_cages import cube_with_hexagon
+from shapes.cages import ISLANDS, RING, bitmap, cube, described, load, with_attributes
 from shapes.scenes import buffer, perspective, scene_with
 from shapes.updates import derivative, differentiated, update
 from shapes.variants import every_ad_variant, exact, shadings
@@ -114,7 +115,7 @@ TOGETHER = [
 
 @pytest.mark.parametrize(("names", "parameters"), TOGETHER)
 def test_gradients_of_views_are_those_of_their_sum_alone_and_together(names, parameters):
-    scene = views_of("direct", with_attributes(ControlCage(cube().positions, MIXED_FACES)), **parameters())
+    scene = views_of("direct", with_attributes(cube_with_hexagon()), **parameters())
     parameters, keys = mi.traverse(scene), [f"shape.{name}" for name in names]
     alone = []
     for key in keys:
