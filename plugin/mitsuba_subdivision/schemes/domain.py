@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from functools import cached_property, lru_cache, reduce
 from typing import Any, NamedTuple
 
@@ -48,7 +47,7 @@ class ParameterMap(NamedTuple):
 IDENTITY = ParameterMap(np.eye(2), np.zeros(2))
 
 
-class ParameterDomain(ABC):
+class ParameterDomain:
     """A parameter domain with a corner at (0, 0), which splits into four copies of half the size, its children.
 
     There are two, `SQUARE` and `TRIANGLE`. Arguments ``u`` and ``v`` may be NumPy or Dr.Jit arrays.
@@ -63,6 +62,7 @@ class ParameterDomain(ABC):
 
     def __init__(self, name: str, area: float, corners: FloatArray, children: tuple[ParameterMap, ...]) -> None:
         self.name, self.area, self.corners, self.children = name, area, corners, children
+        self._is_triangle = len(corners) == 3
 
     @property
     def corner_count(self) -> int:
@@ -90,45 +90,70 @@ class ParameterDomain(ABC):
         """Return ``(s,)`` depth of parameters: positive inside the domain, zero on its edges, negative outside."""
         return reduce(np.minimum, self.edge_distances(uv[..., 0], uv[..., 1]))
 
-    @abstractmethod
     def edge_distances(self, u: Any, v: Any) -> tuple[Any, ...]:
         """Return signed distances of parameters from each edge along `edge_normals`, positive inside."""
+        return (v, 1 - (u + v), u) if self._is_triangle else (v, 1 - u, 1 - v, u)
 
-    @abstractmethod
     def corner_weights(self, u: Any, v: Any) -> tuple[Any, ...]:
         """Return the weights of corners in linear interpolation: bilinear weights, or barycentric coordinates."""
+        if self._is_triangle:
+            return 1 - u - v, u, v
+        return (1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v
 
-    @abstractmethod
     def corner_derivatives(self, u: Any, v: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
         """Return the derivatives of `corner_weights` by u, and by v."""
+        if self._is_triangle:
+            zero = 0 * (u + v)
+            return (zero - 1, zero + 1, zero), (zero - 1, zero, zero + 1)
+        return (v - 1, 1 - v, v, -v), (u - 1, -u, u, 1 - u)
 
     def indices(self, degree: int) -> IntArray:
         """Return ``(n, 2)`` indices along u and v of the grid with ``degree`` intervals along each edge, u fastest."""
         v, u = np.indices((degree + 1, degree + 1)).reshape(2, -1)
         return np.stack([u, v], axis=1)[self.inside(np.stack([u, v], axis=1) / degree) >= -1 / (2 * degree)]
 
-    @abstractmethod
     def extent(self, uv: ArrayLike) -> FloatArray:
         """Return ``(s,)`` size of the smallest copy of the domain, scaled about (0, 0), that contains ``uv``.
 
         The size of the domain is 1.
         """
+        u, v = np.moveaxis(np.asarray(uv), -1, 0)
+        return u + v if self._is_triangle else np.maximum(u, v)
 
-    @abstractmethod
     def first_child(self, uv: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
         """Return the first of `children` that contains parameters ``(2, s)``, and the child's parameters ``(2, s)``."""
+        u, v = uv
+        if not self._is_triangle:
+            top = v > 0.5
+            right = (u > 0.5) | (top & (u == 0.5))
+            return right ^ (3 * top), 2 * uv - np.stack([right, top])
+        is_outer = u + v > 0.5
+        right, top = is_outer & (u >= 0.5), is_outer & (u < 0.5) & (v >= 0.5)
+        is_middle = is_outer & ~right & ~top
+        inner = 2 * uv - np.stack([right, top])
+        return right + 2 * top + 3 * is_middle, np.where(is_middle, 1 - inner, inner)
 
-    @abstractmethod
     def clamped(self, uv: FloatArray) -> FloatArray:
         """Return ``(s, 2)`` parameters clamped to the domain, to the nearest point or close to it."""
+        uv = np.clip(uv, 0, 1)
+        if not self._is_triangle:
+            return uv
+        return np.clip(uv - np.maximum(uv.sum(axis=-1, keepdims=True) - 1, 0) / 2, 0, 1)
 
-    @abstractmethod
     def from_square(self, uv: FloatArray) -> FloatArray:
         """Map ``(s, 2)`` random numbers that are uniform in the unit square to ones that are uniform in the domain."""
+        return np.where(uv.sum(axis=-1, keepdims=True) > 1, 1 - uv, uv) if self._is_triangle else uv
 
-    @abstractmethod
     def quadrature(self, order: int) -> tuple[FloatArray, FloatArray]:
         """Return points ``(g, 2)`` and weights ``(g,)`` of Gauss quadrature, ``order`` points along each parameter."""
+        nodes, weights = _gauss(order)
+        nodes, weights = (nodes + 1) / 2, weights / 2
+        u, v = (grid.ravel() for grid in np.meshgrid(nodes, nodes))
+        products = np.outer(weights, weights).ravel()
+        if self._is_triangle:
+            # The rule of the square, with one side collapsed to a point.
+            v, products = v * (1 - u), products * (1 - u)
+        return np.stack([u, v], axis=1), products
 
 
 @lru_cache(maxsize=32)
@@ -137,81 +162,11 @@ def _gauss(order: int) -> tuple[FloatArray, FloatArray]:
     return np.polynomial.legendre.leggauss(order)
 
 
-class _Square(ParameterDomain):
-    def edge_distances(self, u: Any, v: Any) -> tuple[Any, ...]:
-        return v, 1 - u, 1 - v, u
-
-    def corner_weights(self, u: Any, v: Any) -> tuple[Any, ...]:
-        return (1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v
-
-    def corner_derivatives(self, u: Any, v: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        return (v - 1, 1 - v, v, -v), (u - 1, -u, u, 1 - u)
-
-    def extent(self, uv: ArrayLike) -> FloatArray:
-        uv = np.asarray(uv)
-        return np.maximum(uv[..., 0], uv[..., 1])
-
-    def first_child(self, uv: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-        u, v = uv
-        top = v > 0.5
-        right = (u > 0.5) | (top & (u == 0.5))
-        return right ^ (3 * top), 2 * uv - np.stack([right, top])
-
-    def clamped(self, uv: FloatArray) -> FloatArray:
-        return np.clip(uv, 0, 1)
-
-    def from_square(self, uv: FloatArray) -> FloatArray:
-        return uv
-
-    def quadrature(self, order: int) -> tuple[FloatArray, FloatArray]:
-        nodes, weights = _gauss(order)
-        nodes, weights = (nodes + 1) / 2, weights / 2
-        u, v = (grid.ravel() for grid in np.meshgrid(nodes, nodes))
-        return np.stack([u, v], axis=1), np.outer(weights, weights).ravel()
-
-
-class _Triangle(ParameterDomain):
-    def edge_distances(self, u: Any, v: Any) -> tuple[Any, ...]:
-        return v, 1 - (u + v), u
-
-    def corner_weights(self, u: Any, v: Any) -> tuple[Any, ...]:
-        return 1 - u - v, u, v
-
-    def corner_derivatives(self, u: Any, v: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        zero = 0 * (u + v)
-        return (zero - 1, zero + 1, zero), (zero - 1, zero, zero + 1)
-
-    def extent(self, uv: ArrayLike) -> FloatArray:
-        uv = np.asarray(uv)
-        return uv[..., 0] + uv[..., 1]
-
-    def first_child(self, uv: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-        u, v = uv
-        is_outer = u + v > 0.5
-        right, top = is_outer & (u >= 0.5), is_outer & (u < 0.5) & (v >= 0.5)
-        is_middle = is_outer & ~right & ~top
-        inner = 2 * uv - np.stack([right, top])
-        return right + 2 * top + 3 * is_middle, np.where(is_middle, 1 - inner, inner)
-
-    def clamped(self, uv: FloatArray) -> FloatArray:
-        uv = np.clip(uv, 0, 1)
-        return np.clip(uv - np.maximum(uv.sum(axis=-1, keepdims=True) - 1, 0) / 2, 0, 1)
-
-    def from_square(self, uv: FloatArray) -> FloatArray:
-        return np.where(uv.sum(axis=-1, keepdims=True) > 1, 1 - uv, uv)
-
-    def quadrature(self, order: int) -> tuple[FloatArray, FloatArray]:
-        # The rule of the square, with one side collapsed to a point.
-        uv, weights = SQUARE.quadrature(order)
-        u, v = uv.T
-        return np.stack([u, v * (1 - u)], axis=1), weights * (1 - u)
-
-
 def _halved(sign: float, offset: tuple[float, float]) -> ParameterMap:
     return ParameterMap(2 * sign * np.eye(2), np.array(offset, dtype=float))
 
 
-SQUARE: ParameterDomain = _Square(
+SQUARE = ParameterDomain(
     "square",
     1.0,
     np.array([(0, 0), (1, 0), (1, 1), (0, 1)], dtype=float),
@@ -219,7 +174,7 @@ SQUARE: ParameterDomain = _Square(
 )
 
 # The middle child is rotated by half a turn: its parameters run backwards.
-TRIANGLE: ParameterDomain = _Triangle(
+TRIANGLE = ParameterDomain(
     "triangle",
     0.5,
     np.array([(0, 0), (1, 0), (0, 1)], dtype=float),
