@@ -121,7 +121,8 @@ SMALL, SINGLE = 1e-5, 1e-5
 @pytest.mark.parametrize(
     ("cage", "matrix"),
     [
-        *((name, matrix) for name in ("creased", "valence 3") for matrix in (None, np.eye(4), MATRIX, MIRRORED)),
+        *(("creased", matrix) for matrix in (np.eye(4), MIRRORED)),
+        ("valence 3", MATRIX),
         *((name, None) for name in ("mixed", "refined", "loop")),
     ],
     indirect=["cage"],
@@ -178,18 +179,18 @@ DISPLACED_STEP, DISPLACED = 3e-3, 1e-3
 
 
 @llvm
-@pytest.mark.parametrize("of", ["positions", "normals"])
 @pytest.mark.parametrize("by", ["displacement.data", "cage_weight"])
 @pytest.mark.parametrize("cage", ["creased", "valence 3"], indirect=True)
-def test_derivatives_of_displaced_vertices_are_central_differences(cage, by, of, np_rng):
+def test_derivatives_of_displaced_vertices_are_central_differences(cage, by, np_rng):
     heights = {**HEIGHTS, "displacement": bitmap(IMAGE)} if by == "displacement.data" else HEIGHTS
     parameters = mi.traverse(load(cage, tessellation_rate=RATE, to_world=mi.ScalarTransform4f(MATRIX), **heights))
-    weights = np_rng.normal(size=dr.width(parameters[f"vertex_{of}"]))
-    weights = upload(mi.Float, weights / np.sqrt(len(weights)))
+    size = dr.width(parameters["vertex_positions"])
+    weights = [upload(mi.Float, np_rng.normal(size=size) / np.sqrt(size)) for _ in range(2)]
     assign = moving(parameters, [*PLACED, SCALE, by], np_rng)
 
     def loss():
-        return dr.sum(weights * parameters[f"vertex_{of}"])
+        positions, normals = (parameters[f"vertex_{name}"] for name in ("positions", "normals"))
+        return dr.dot(weights[0], positions) + dr.dot(weights[1], normals)
 
     backward, forward, difference = (derivative(mode, assign, loss, DISPLACED_STEP) for mode in MODES)
     assert backward == pytest.approx(difference, abs=DISPLACED)
