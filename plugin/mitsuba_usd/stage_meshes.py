@@ -224,9 +224,8 @@ def read_normals(reader: MeshReader, cage: CageContents) -> NDArray[np.float64] 
 def read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[CageContents, NDArray[np.float64] | None]:
     """A Cube, Plane, Sphere, Cylinder, Cone or Capsule as polygons, maybe with normals at face corners."""
 
-    def number(name: str, usual: float) -> float:
-        value = value_at(prim.GetAttribute(name), time)
-        size = usual if value is None else float(value)
+    def number(name: str) -> float:
+        size = float(value_at(prim.GetAttribute(name), time))
         if not 0 <= size < np.inf:
             raise ValueError(f"{name} is {size}; expected a finite number, 0 or more")
         return size
@@ -243,41 +242,37 @@ def read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[CageContents, NDArra
     return cage, None if normals is None else normals[:, turn]
 
 
-Number = Callable[[str, float], float]
+Number = Callable[[str], float]
 Polygons = tuple[NDArray[np.float64], "NDArray[np.float64] | None", IntArray, IntArray]
 # Points and normals along the profile of a surface of revolution, as (distance, z).
 Line = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 def _cube(number: Number) -> Polygons:
-    half = number("size", 2.0) / 2
+    half = number("size") / 2
     points = half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
     vertices = np.array([0, 1, 3, 2, 4, 6, 7, 5, 0, 4, 5, 1, 2, 3, 7, 6, 0, 2, 6, 4, 1, 5, 7, 3])
     return points, None, np.full(6, 4), vertices
 
 
 def _plane(number: Number) -> Polygons:
-    half = np.array([number("width", 2.0), number("length", 2.0), 0.0]) / 2
+    half = np.array([number("width"), number("length"), 0.0]) / 2
     points = half * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=np.float64)
     return points, None, np.array([4]), np.arange(4)
 
 
-def _round(
-    outline: Callable[[float, float], list[Line]], number: Number, radius: float = 1.0, height: float = 2.0
-) -> Polygons:
+def _round(outline: Callable[[float, float], list[Line]], number: Number) -> Polygons:
     """A surface of revolution, by its outline for a radius and half a height."""
-    return _revolved(outline(number("radius", radius), number("height", height) / 2))
+    return _revolved(outline(number("radius"), number("height") / 2))
 
 
 GPRIMS: dict[str, Callable[[Number], Polygons]] = {
     "Cube": _cube,
     "Plane": _plane,
-    "Sphere": lambda number: _revolved([_arc(number("radius", 1.0), -90, 90, 0.0)]),
+    "Sphere": lambda number: _revolved([_arc(number("radius"), -90, 90, 0.0)]),
     "Cylinder": partial(_round, lambda r, h: _lines((0, -h), (r, -h), (r, h), (0, h))),
     "Cone": partial(_round, lambda r, h: _lines((0, -h), (r, -h), (0, h))),
-    "Capsule": partial(
-        _round, lambda r, h: [_arc(r, -90, 0, -h), *_lines((r, -h), (r, h)), _arc(r, 0, 90, h)], radius=0.5, height=1.0
-    ),
+    "Capsule": partial(_round, lambda r, h: [_arc(r, -90, 0, -h), *_lines((r, -h), (r, h)), _arc(r, 0, 90, h)]),
 }
 
 
