@@ -339,8 +339,9 @@ def _without_effect(category: str, kind: str, given: dict[str, Input]) -> Input 
 _COMPARED: dict[str, Callable[[float, float], bool]] = {
     "ifgreater": operator.gt, "ifgreatereq": operator.ge, "ifequal": operator.eq,
 }  # fmt: skip
-# Colours by which a node of pictures is tried out: black, the four channels, and some for which all channels differ.
-_TRIED_COLORS = np.array([[0.0] * 4, *np.eye(4).tolist(), [0.37, 0.61, 0.83, 0.29], [-2.3, 5.7, 17.1, -3.9]])
+# Colours by which a node of pictures is tried out: black, the four channels, and others, within 0 to 1 and beyond.
+_random = np.random.default_rng(0)
+_TRIED_COLORS = np.vstack([np.zeros(4), np.eye(4), _random.random((8, 4)), _random.uniform(-20, 20, (8, 4))])
 
 
 def _picture(category: str, kind: str, given: dict[str, Input]) -> TextureContents | None:
@@ -369,9 +370,9 @@ def _picture(category: str, kind: str, given: dict[str, Input]) -> TextureConten
     bias, slopes, columns = values[0], values[1:5] - values[0], np.arange(values.shape[1])
     channels = np.abs(slopes).argmax(axis=0)
     factor = slopes[channels, columns]
-    if not factor.all() or not np.allclose(
-        _TRIED_COLORS[:, channels] * factor + bias, values[:-1], rtol=1e-9, atol=1e-12
-    ):
+    expected = _TRIED_COLORS[:, channels] * factor + bias
+    # What is constant for all that is tried may be a step beyond.
+    if not factor.all() or not np.allclose(values[:-1], expected, rtol=1e-9, atol=1e-12):
         return None
     if np.ptp(np.vstack([channels, values]), axis=1).max() == 0:
         # One channel serves as a colour.

@@ -1,6 +1,7 @@
 """What MaterialX nodes compute, against values by hand and a second implementation of the noises."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,47 +20,70 @@ def picture(channel="rgb", name="a.png", to_uv=((1, 0, 0), (0, 1, 0), (0, 0, 1))
 GREY = [0.2, 0.5, 0.7]
 
 
+CASES = [
+    ("add", "color3", {"in1": GREY, "in2": 0.1}, [0.3, 0.6, 0.8]),
+    ("subtract", "float", {"in1": 0.2, "in2": 0.5}, -0.3),
+    ("multiply", "color3", {"in1": GREY, "in2": [2.0, 1.0, 0.5]}, [0.4, 0.5, 0.35]),
+    ("divide", "float", {"in1": 1.0, "in2": 4.0}, 0.25),
+    ("divide", "float", {"in1": 1.0, "in2": 0.0}, 0.0),
+    ("modulo", "float", {"in1": -0.25, "in2": 1.0}, 0.75),
+    ("invert", "float", {"in_": 0.3, "amount": 1.0}, 0.7),
+    ("power", "float", {"in1": 0.5, "in2": 2.0}, 0.25),
+    ("clamp", "vector3", {"in_": [-1.0, 0.5, 2.0], "low": 0.0, "high": 1.0}, [0, 0.5, 1]),
+    ("mix", "color3", {"bg": [0.0] * 3, "fg": GREY, "mix": 0.5}, [0.1, 0.25, 0.35]),
+    ("remap", "float", {"in_": 0.25, "inlow": 0.0, "inhigh": 0.5, "outlow": 2.0, "outhigh": 4.0}, 3.0),
+    ("smoothstep", "float", {"in_": 0.25, "low": 0.0, "high": 1.0}, 0.15625),
+    ("luminance", "color3", {"in_": [1.0, 0.0, 0.0], "lumacoeffs": [0.3, 0.6, 0.1]}, [0.3] * 3),
+    ("rgbtohsv", "color3", {"in_": [0.5, 0.25, 0.25]}, [0, 0.5, 0.5]),
+    ("hsvtorgb", "color3", {"in_": [2 / 3, 0.5, 0.5]}, [0.25, 0.25, 0.5]),
+    ("extract", "float", {"in_": GREY, "index": 1.0}, 0.5),
+    ("combine3", "color3", {"in1": 0.1, "in2": 0.2, "in3": 0.3}, [0.1, 0.2, 0.3]),
+    ("convert", "color3", {"in_": 0.4}, [0.4] * 3),
+    ("convert", "color4", {"in_": GREY}, [*GREY, 1]),
+    ("dotproduct", "float", {"in1": [1.0, 2.0, 3.0], "in2": [1.0, 0.0, 1.0]}, 4.0),
+    ("crossproduct", "vector3", {"in1": [1.0, 0.0, 0.0], "in2": [0.0, 1.0, 0.0]}, [0, 0, 1]),
+    ("normalize", "vector3", {"in_": [3.0, 0.0, 4.0]}, [0.6, 0, 0.8]),
+    ("rotate2d", "vector2", {"in_": [1.0, 0.0], "amount": 90.0}, [0, -1]),
+    ("rotate3d", "vector3", {"in_": [1.0, 0.0, 0.0], "amount": 90.0, "axis": [0.0, 0.0, 1.0]}, [0, 1, 0]),
+    # Around an axis, its own points stay, and a third of a turn around the diagonal exchanges the others.
+    ("rotate3d", "vector3", {"in_": [0.0, 0.0, 2.0], "amount": 50.0, "axis": [0.0, 0.0, 1.0]}, [0, 0, 2]),
+    ("rotate3d", "vector3", {"in_": [1.0, 2.0, 3.0], "amount": 120.0, "axis": [1.0, 1.0, 1.0]}, [3, 1, 2]),
+    ("screen", "float", {"fg": 0.5, "bg": 0.5, "mix": 1.0}, 0.75),
+    ("dodge", "float", {"fg": 0.5, "bg": 0.25, "mix": 1.0}, 0.5),
+    ("burn", "float", {"fg": 0.5, "bg": 0.75, "mix": 1.0}, 0.5),
+    ("ifgreater", "float", {"value1": 2.0, "value2": 1.0, "in1": 5.0, "in2": 6.0}, 5.0),
+    ("ifequal", "float", {"value1": 2.0, "value2": 1.0, "in1": 5.0, "in2": 6.0}, 6.0),
+    ("roughness_anisotropy", "vector2", {"roughness": 0.5, "anisotropy": 0.75}, [0.5, 0.125]),
+]
+
+
 @pytest.mark.core
-@pytest.mark.parametrize(
-    ("category", "kind", "inputs", "expected"),
-    [
-        ("add", "color3", {"in1": GREY, "in2": 0.1}, [0.3, 0.6, 0.8]),
-        ("subtract", "float", {"in1": 0.2, "in2": 0.5}, -0.3),
-        ("multiply", "color3", {"in1": GREY, "in2": [2.0, 1.0, 0.5]}, [0.4, 0.5, 0.35]),
-        ("divide", "float", {"in1": 1.0, "in2": 4.0}, 0.25),
-        ("divide", "float", {"in1": 1.0, "in2": 0.0}, 0.0),
-        ("modulo", "float", {"in1": -0.25, "in2": 1.0}, 0.75),
-        ("invert", "float", {"in_": 0.3, "amount": 1.0}, 0.7),
-        ("power", "float", {"in1": 0.5, "in2": 2.0}, 0.25),
-        ("clamp", "vector3", {"in_": [-1.0, 0.5, 2.0], "low": 0.0, "high": 1.0}, [0, 0.5, 1]),
-        ("mix", "color3", {"bg": [0.0] * 3, "fg": GREY, "mix": 0.5}, [0.1, 0.25, 0.35]),
-        ("remap", "float", {"in_": 0.25, "inlow": 0.0, "inhigh": 0.5, "outlow": 2.0, "outhigh": 4.0}, 3.0),
-        ("smoothstep", "float", {"in_": 0.25, "low": 0.0, "high": 1.0}, 0.15625),
-        ("luminance", "color3", {"in_": [1.0, 0.0, 0.0], "lumacoeffs": [0.3, 0.6, 0.1]}, [0.3] * 3),
-        ("rgbtohsv", "color3", {"in_": [0.5, 0.25, 0.25]}, [0, 0.5, 0.5]),
-        ("hsvtorgb", "color3", {"in_": [2 / 3, 0.5, 0.5]}, [0.25, 0.25, 0.5]),
-        ("extract", "float", {"in_": GREY, "index": 1.0}, 0.5),
-        ("combine3", "color3", {"in1": 0.1, "in2": 0.2, "in3": 0.3}, [0.1, 0.2, 0.3]),
-        ("convert", "color3", {"in_": 0.4}, [0.4] * 3),
-        ("convert", "color4", {"in_": GREY}, [*GREY, 1]),
-        ("dotproduct", "float", {"in1": [1.0, 2.0, 3.0], "in2": [1.0, 0.0, 1.0]}, 4.0),
-        ("crossproduct", "vector3", {"in1": [1.0, 0.0, 0.0], "in2": [0.0, 1.0, 0.0]}, [0, 0, 1]),
-        ("normalize", "vector3", {"in_": [3.0, 0.0, 4.0]}, [0.6, 0, 0.8]),
-        ("rotate2d", "vector2", {"in_": [1.0, 0.0], "amount": 90.0}, [0, -1]),
-        ("rotate3d", "vector3", {"in_": [1.0, 0.0, 0.0], "amount": 90.0, "axis": [0.0, 0.0, 1.0]}, [0, 1, 0]),
-        # Around an axis, its own points stay, and a third of a turn around the diagonal exchanges the others.
-        ("rotate3d", "vector3", {"in_": [0.0, 0.0, 2.0], "amount": 50.0, "axis": [0.0, 0.0, 1.0]}, [0, 0, 2]),
-        ("rotate3d", "vector3", {"in_": [1.0, 2.0, 3.0], "amount": 120.0, "axis": [1.0, 1.0, 1.0]}, [3, 1, 2]),
-        ("screen", "float", {"fg": 0.5, "bg": 0.5, "mix": 1.0}, 0.75),
-        ("dodge", "float", {"fg": 0.5, "bg": 0.25, "mix": 1.0}, 0.5),
-        ("burn", "float", {"fg": 0.5, "bg": 0.75, "mix": 1.0}, 0.5),
-        ("ifgreater", "float", {"value1": 2.0, "value2": 1.0, "in1": 5.0, "in2": 6.0}, 5.0),
-        ("ifequal", "float", {"value1": 2.0, "value2": 1.0, "in1": 5.0, "in2": 6.0}, 6.0),
-        ("roughness_anisotropy", "vector2", {"roughness": 0.5, "anisotropy": 0.75}, [0.5, 0.125]),
-    ],
-)
+@pytest.mark.parametrize(("category", "kind", "inputs", "expected"), CASES)
 def test_what_is_constant_is_computed(category, kind, inputs, expected):
     np.testing.assert_allclose(node(category, kind, **inputs), expected, atol=1e-7)
+
+
+@pytest.mark.parametrize(("category", "kind", "inputs", "_expected"), CASES)
+def test_a_node_of_a_picture_has_its_values_whether_or_not_it_stays_a_picture(category, kind, inputs, _expected):
+    """In place of each input, of colours from -3 to 3 and of one that stands for a file that is not there."""
+    random = np.random.default_rng(5)
+    colors = random.uniform(-3, 3, (20, 4))
+    for name, given in inputs.items():
+        if name == "index":
+            continue
+        scale, bias, fallback = random.uniform(-2, 2, (3, 4)).tolist()
+        whole = TextureContents("a.png", "rgb" if np.ndim(given) else "g", "raw", "repeat", scale, bias)
+        made = node(category, kind, **{**inputs, name: replace(whole, fallback=fallback)})
+        plain = {"in" if key == "in_" else key: np.atleast_1d(value) for key, value in inputs.items()}
+        rows = np.vstack([colors * scale + bias, np.float32(fallback)])[:, whole.channels]
+        expected = operation(category, kind, {**plain, name.rstrip("_"): rows})
+        with np.errstate(all="ignore"):
+            values = evaluate(
+                made, colors, lambda texture, _: (colors * texture.scale + texture.bias)[:, texture.channels]
+            )
+        np.testing.assert_allclose(np.broadcast_to(values, expected[:-1].shape), expected[:-1], rtol=1e-5, atol=1e-5)
+        missing = np.broadcast_to(evaluate(made, colors), expected[:1].shape)
+        np.testing.assert_allclose(missing[0], expected[-1], rtol=1e-4, atol=1e-4)
 
 
 def test_operations_take_arrays_of_points():
