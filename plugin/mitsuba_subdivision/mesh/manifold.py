@@ -70,10 +70,10 @@ def is_repeated(topology: Topology) -> NDArray[np.bool_]:
     """Return ``(n_h,)``: whether the vertex at each face corner is also at an earlier corner of the face."""
     t = topology
     # A (face, vertex) pair as one number.
-    return _is_later(t.face.astype(np.int64) * t.vertex_count + t.face_vertices)
+    return is_later(t.face.astype(np.int64) * t.vertex_count + t.face_vertices)
 
 
-def _is_later(keys: IntArray) -> NDArray[np.bool_]:
+def is_later(keys: IntArray) -> NDArray[np.bool_]:
     """Return whether an equal key precedes each key."""
     order = np.argsort(keys, kind="stable")
     later = np.zeros(len(keys), dtype=bool)
@@ -136,7 +136,7 @@ def separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
     start, end = t.face_vertices, t.face_vertices[t.next]
     sides = np.bincount(t.edge, minlength=t.edge_count)
     is_loop = start == end
-    is_second = _is_later(t.edge.astype(np.int64) * t.face_count + t.face)
+    is_second = is_later(t.edge.astype(np.int64) * t.face_count + t.face)
     is_non_manifold = np.zeros(t.edge_count, dtype=bool)
     is_non_manifold[t.edge[is_loop | is_second | runs_with_twin(t) | (sides[t.edge] > 2)]] = True
     edges = is_non_manifold[t.edge]

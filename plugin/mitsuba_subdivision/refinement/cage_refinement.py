@@ -23,7 +23,7 @@ from ..mesh.sharpness import INFINITE
 from ..schemes import Scheme, SchemeError
 from ..schemes.scheme import Refinement
 from .adapted_scheme import adapted_scheme
-from .refined_corners import RefinedCorners, common_mode, differences, refined_attributes
+from .refined_corners import VERTEX, RefinedCorners, common_mode, differences, refined_attributes
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -87,7 +87,10 @@ def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRe
     refinement = scheme.refine(cage.cut_mesh.topology)
     corners = RefinedCorners.of(cage, scheme, refinement.topology)
     matrix = _over_control_points(cage, refinement, corners.copies)
-    element, corner = corners.elements()
+    t, first = cage.topology, refinement.topology.face_offsets[:-1]
+    half_edge = corners.half_edge[first].astype(np.int64)
+    element = t.face[half_edge].astype(np.int64)
+    corner = np.where(corners.kind[first] == VERTEX, half_edge - t.face_offsets[element], -1)
     contents = replace(
         contents,
         positions=matrix @ cage.positions,
@@ -158,7 +161,9 @@ def _refined_sharpness(tags: Sharpness, refinement: Refinement, corners: Refined
     """Return the sharpness of the refined cage: finite sharpness is lowered."""
     semi = refinement.topology.semi_sharpness
     edges = np.zeros(refinement.topology.half_edge_count) if semi is None else semi.edges.copy()
-    edges[(corners.old_edge >= 0) & tags.is_infinite[corners.old_edge]] = INFINITE
+    # Halves of coarse edges begin or end at a coarse vertex.
+    is_half = (corners.kind == VERTEX) | (corners.kind[corners.refined.next] == VERTEX)
+    edges[is_half & tags.is_infinite[corners.half_edge]] = INFINITE
     vertices = np.zeros(len(corners.copies))
     vertices[: len(tags.vertices)] = np.where(tags.is_corner, INFINITE, np.maximum(tags.vertices - 1, 0))
     return Sharpness(edges, vertices)

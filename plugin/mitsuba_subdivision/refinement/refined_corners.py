@@ -14,6 +14,7 @@ from ..cage.control_cage import ControlCage
 from ..cage.errors import CageError, shortened
 from ..mesh.connectivity import IntArray, Topology, VertexRule
 from ..mesh.cuts import value_mesh
+from ..mesh.manifold import is_later
 from ..schemes import Scheme, SchemeError
 from ..schemes.scheme import Refinement
 from .adapted_scheme import subdivided_values
@@ -86,9 +87,7 @@ class RefinedCorners:
         """``(n_h,)`` whether a face has the edge twice. Its two sides then need separate edge points."""
         t = self.cage.topology
         edge_and_face = self.edge.astype(np.int64) * t.face_count + t.face
-        _, which, count = np.unique(edge_and_face, return_inverse=True, return_counts=True)
-        is_double = np.zeros(int(self.edge.max()) + 1, dtype=bool)
-        is_double[self.edge[count[which.ravel()] > 1]] = True
+        is_double = np.bincount(self.edge, is_later(edge_and_face)) > 0
         return is_double[self.edge]
 
     @cached_property
@@ -113,22 +112,6 @@ class RefinedCorners:
         is_new = self.vertex >= self.cage.vertex_count
         copies[self.vertex[is_new]] = self.refined.face_vertices[is_new]
         return copies
-
-    @cached_property
-    def old_edge(self) -> IntArray:
-        """``(n_c,)`` half-edge of the cage of which each refined half-edge is a half, -1 for new edges."""
-        end = self.refined.next
-        is_edge, goes_to_edge = self.kind == EDGE, self.kind[end] == EDGE
-        from_edge = np.where(is_edge & (self.kind[end] == VERTEX), self.half_edge, -1)
-        return np.where(goes_to_edge & (self.kind == VERTEX), self.half_edge[end], from_edge)
-
-    def elements(self) -> tuple[IntArray, IntArray]:
-        """Return the face of the cage that contains each refined face, and the corner at which it lies, -1 for none."""
-        t, first = self.cage.topology, self.refined.face_offsets[:-1]
-        half_edge = self.half_edge[first].astype(np.int64)
-        face = t.face[half_edge].astype(np.int64)
-        corner = np.where(self.kind[first] == VERTEX, half_edge - t.face_offsets[face], -1)
-        return face, corner
 
     def values(
         self,
