@@ -17,15 +17,6 @@ split vertex       A vertex of the tessellation with attributes (`AttributeTable
                    seams are split into a copy for each side.
 =================  ====================================================================================================
 
-These maps convert between them:
-
-===================  ==================================================================================================
-`control_of_vertex`  From a mesh vertex to its control point or, for attributes, to a row of values.
-`controls`           From a patch to the control points of its one-ring.
-`weld_target`        From a vertex to the vertex whose position it takes: another one, if it is a copy along a crease.
-`surface_vertex`     From a split vertex to the vertex of which it is a copy.
-===================  ==================================================================================================
-
 A patch belongs to a class (`PatchClass`), whose weights (`VertexPolynomials`) are computed once for all its patches.
 The corner of an element is identified by the half-edge of `PatchTable.elements` that begins there.
 """
