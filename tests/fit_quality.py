@@ -30,6 +30,7 @@ import mitsuba_subdivision as msub
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.figures.fit import LIGHTS, integrator
 from mitsuba_subdivision.fit import CageFit, Schedule, View
@@ -59,10 +60,7 @@ CREASE_TARGET_SPP = 4096
 CREASE_START = 2.6
 STAGE = {"integrator": integrator(SPP, EDGE_SPP), **LIGHTS}
 BSDF = {"type": "twosided", "inside": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}}}
-CUBE = msub.ControlCage(
-    [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)],
-    [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]],
-)
+CUBE = cube()
 
 
 class Course(NamedTuple):
@@ -310,17 +308,17 @@ def fitted_mesh(target: Triangles, views: list[View], course: Course, seed: int,
 
 def fitted_creases(seed: int) -> tuple[float, float, float]:
     """Mean and largest error of sharpness, and megabytes that the process has grown by."""
-    cube = CUBE.with_positions(0.8 * CUBE.positions)
+    start = CUBE.with_positions(0.8 * CUBE.positions)
     # By how high their ends lie: below, uprights, above.
-    sharpness = np.array([1.5, 0.8, 2.3])[(cube.positions[cube.edges, 2] > 0).sum(axis=1)]
-    box = tagged(cube, sharpness).with_positions(cube.positions * (1.1, 1.0, 0.9))
+    sharpness = np.array([1.5, 0.8, 2.3])[(start.positions[start.edges, 2] > 0).sum(axis=1)]
+    box = tagged(start, sharpness).with_positions(start.positions * (1.1, 1.0, 0.9))
     views, peaks = pictures(Triangles.of_surface(box, 32), CREASE_TARGET_SPP), []
     fit = CageFit(
-        tagged(cube, np.full(len(sharpness), CREASE_START)),
+        tagged(start, np.full(len(sharpness), CREASE_START)),
         views,
         STAGE,
         shape={"bsdf": BSDF, "tessellation_rate": 16},
-        sharp_edges=cube.edges,
+        sharp_edges=start.edges,
         smoothing=0,
         learning_rate=[(0, 0.03), (CREASE_STEPS / 2, 0.03), (CREASE_STEPS, 0.001)],
         sharpness_rate=[(0, 0.3), (CREASE_STEPS / 2, 0.3), (CREASE_STEPS, 0.02)],
