@@ -131,10 +131,9 @@ def _with_tags(
 
     Raises CageError if there are no such tags.
     """
-    expected, cut = refinement.topology, cage.cut_mesh.topology
+    expected = refinement.topology
     sharpness = _refined_sharpness(cage.tags, refinement, corners)
-    # The edge point of a border edge between two corners does not move in later refinements, like a corner.
-    stays = corners.at_ends(cut.vertex_rules == VertexRule.CORNER, cut)
+    stays = corners.between_corners(cage.cut_mesh.topology)
     rules = expected.vertex_rules[expected.face_vertices]
     for _ in range(MOST_REPAIRS):
         sharp = np.flatnonzero(sharpness.edges)

@@ -29,8 +29,8 @@ MEAN_TOLERANCE = 1e-13
 # Number of decimals of sharpness across cuts when comparing rows.
 DECIMALS = 12
 BoolArray = NDArray[np.bool_]
-# The refined mesh of an attribute's values; (n_c,) bool: whether a refined corner is the edge point of a border edge
-# between two corners, which does not move; and (n_c,) int64: index of the refined value at each refined corner.
+# The refined mesh of an attribute's values; `RefinedCorners.between_corners`; and (n_c,) int64: index of the refined
+# value at each refined corner.
 ValueMesh = tuple[Topology, BoolArray, IntArray]
 # Kinds of parents of a refined vertex.
 VERTEX, EDGE, FACE = range(3)
@@ -143,15 +143,14 @@ class RefinedCorners:
         along = (values[h] + values[t.next[h]]) / 2
         return np.select([kind == VERTEX, kind == FACE], [values[h], means[t.face[h]]], along)
 
-    def at_ends(
-        self,
-        of_vertices: NDArray[np.bool_],  # (n_v,) bool: condition at each vertex
-        topology: Topology,  # The coarse mesh, cut along creases or seams
-    ) -> NDArray[np.bool_]:
-        """Return ``(n_c,)``: whether a corner is the edge point of a border edge whose ends fulfil the condition."""
+    def between_corners(self, topology: Topology) -> BoolArray:
+        """Return ``(n_c,)``: whether a corner is the edge point of a border edge between two corners of a coarse mesh.
+
+        It does not move in later refinements, like a corner.
+        """
         h, t = self.half_edge, topology
-        ends = of_vertices[t.face_vertices[h]] & of_vertices[t.face_vertices[t.next[h]]]
-        return (self.kind == EDGE) & (t.twin[h] < 0) & ends
+        is_corner = t.vertex_rules[t.face_vertices] == VertexRule.CORNER
+        return (self.kind == EDGE) & (t.twin[h] < 0) & is_corner[h] & is_corner[t.next[h]]
 
 
 def _are_one_to_one(one: IntArray, other: IntArray) -> bool:
@@ -199,7 +198,7 @@ def refined_attributes(
                 t, value_index = subdivided_values(cage, scheme, name, attribute)
                 of_values = refinement if t is cage.cut_mesh.topology else scheme.refine(t)
                 corner_values = of_values.apply(values[value_index])[of_values.topology.face_vertices]
-                stays = corners.at_ends(t.vertex_rules == VertexRule.CORNER, t)
+                stays = corners.between_corners(t)
                 value_meshes[name] = of_values.topology, stays, new_indices
             attributes[name] = Attribute(corner_values[first], "face_varying", new_indices)
     return {"texcoords": attributes.pop(TEXCOORDS, None), "attributes": attributes}, value_meshes
