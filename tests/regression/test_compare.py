@@ -11,7 +11,7 @@ import pytest
 from mitsuba_subdivision.regression import RegressionError
 from mitsuba_subdivision.regression.compare import compare, relmse
 from mitsuba_subdivision.regression.image import Image
-from mitsuba_subdivision.regression.tiers import Status, Tolerances, compare_flip, flip_exposures
+from mitsuba_subdivision.regression.tiers import Status, Tolerances, compare_flip, flip_exposures, normal_angle
 from regression.random_images import METADATA, SIZE, dome, random_image, truth
 
 LIMITS = Tolerances()
@@ -176,6 +176,12 @@ def test_exposures_are_those_that_flip_chooses_and_do_not_depend_on_what_is_belo
     np.testing.assert_allclose(ends, [chosen["startExposure"], chosen["stopExposure"]], rtol=0, atol=0.001)
     assert count == chosen["numExposures"] > 2
     assert flip_exposures(pixels * [-1, 1, 1]) == flip_exposures(pixels * [0, 1, 1])
+
+
+@pytest.mark.parametrize("degrees", [1e-6, 30, 179])
+def test_angles_between_normals_are_those_of_a_turn(degrees):
+    turned = np.array([math.cos(math.radians(degrees)), math.sin(math.radians(degrees)), 0])
+    assert math.isclose(normal_angle(np.array([1.0, 0, 0]), turned), degrees, rel_tol=1e-9)
 
 
 def test_probes_that_hit_nothing_are_alike(reference, np_rng):
