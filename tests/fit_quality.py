@@ -34,7 +34,6 @@ from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.figures.fit import LIGHTS, integrator
 from mitsuba_subdivision.fit import CageFit, Schedule, View
-from mitsuba_subdivision.fit.point_fit import triangle_samples
 from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
 from scipy.spatial import cKDTree
 
@@ -116,7 +115,8 @@ class Triangles(NamedTuple):
     def samples(self, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Random points, uniform by area, and their normals."""
         a, b, c = self.positions[self.triangles].swapaxes(0, 1)
-        chosen, weights = triangle_samples(np.linalg.norm(np.cross(b - a, c - a), axis=1), count, seed)
+        areas, rng = np.linalg.norm(np.cross(b - a, c - a), axis=1), np.random.default_rng(seed)
+        chosen, weights = rng.choice(len(areas), count, p=areas / areas.sum()), rng.dirichlet(np.ones(3), count)
         corners, weights = self.triangles[chosen], weights[:, :, None]
         points, normals = ((each[corners] * weights).sum(axis=1) for each in (self.positions, self.normals))
         return points, unit(normals)

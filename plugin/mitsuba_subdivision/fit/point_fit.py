@@ -252,20 +252,7 @@ def mesh_samples(positions: FloatArray, triangles: IntArray, count: int, seed: i
     doubled = np.linalg.norm(normals, axis=1)
     if not doubled.sum() > 0:
         raise ValueError("the mesh has no area; expected triangles")
-    chosen, weights = triangle_samples(doubled, count, seed)
+    rng = np.random.default_rng(seed)
+    chosen, weights = rng.choice(len(triangles), count, p=doubled / doubled.sum()), rng.dirichlet(np.ones(3), count)
     points: FloatArray = (positions[triangles[chosen]] * weights[:, :, None]).sum(axis=1)
     return points, normals[chosen] / doubled[chosen, None]
-
-
-def triangle_samples(
-    areas: FloatArray,  # (m,): in any unit; some of them are not zero
-    count: int,
-    seed: int,
-) -> tuple[IntArray, FloatArray]:
-    """Locations on triangles, uniform by area.
-
-    Returns 0-based triangles ``(count,)`` int64, and weights ``(count, 3)`` float64 of their three vertices; these are
-    not negative, and their sum is one.
-    """
-    rng = np.random.default_rng(seed)
-    return rng.choice(len(areas), count, p=areas / areas.sum()), rng.dirichlet(np.ones(3), count)

@@ -210,21 +210,18 @@ def _trace_arrays(loaded: LoadedScene, width: int, height: int) -> tuple[NDArray
 
 def _trace_one_by_one(loaded: LoadedScene, width: int, height: int) -> tuple[NDArray, ...]:
     """Trace as `_trace_arrays` does, in a scalar variant."""
-    count = width * height
-    position, normal, uv = (np.zeros((count, n), dtype=np.float32) for n in (3, 3, 2))
-    triangle, shape = (np.full(count, NOTHING, dtype=np.uint32) for _ in range(2))
     # Any, as the stubs are those of variants with arrays.
     sensor: Any = loaded.sensor
     scene: Any = loaded.scene
-    shapes = scene.shapes()
-    for i in range(count):
-        film_position = [(i % width + 0.5) / width, (i // width + 0.5) / height]
-        ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, film_position, [0.5, 0.5])
+    shapes, nothing = scene.shapes(), ([0] * 3, [0] * 3, [0] * 2, NOTHING, NOTHING)
+    rows = []
+    for y, x in np.ndindex(height, width):
+        ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, [(x + 0.5) / width, (y + 0.5) / height], [0.5, 0.5])
         hit = scene.ray_intersect(ray)
-        if hit.is_valid():
-            position[i], normal[i], uv[i] = hit.p, hit.sh_frame.n, hit.uv
-            triangle[i], shape[i] = hit.prim_index, shapes.index(hit.shape)
-    return position, normal, uv, triangle, shape
+        first = hit.p, hit.sh_frame.n, hit.uv, hit.prim_index
+        rows.append((*first, shapes.index(hit.shape)) if hit.is_valid() else nothing)
+    kinds = np.float32, np.float32, np.float32, np.uint32, np.uint32
+    return tuple(np.array(column, dtype=kind) for column, kind in zip(zip(*rows, strict=True), kinds, strict=True))
 
 
 def _elements(scene: mi.Scene, shape: NDArray[np.uint32], triangle: NDArray[np.uint32]) -> NDArray[np.uint32]:

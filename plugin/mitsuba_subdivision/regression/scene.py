@@ -88,7 +88,9 @@ def load_scene(
     scene, files = (source, {}) if isinstance(source, mi.Scene) else _parsed_scene(source, given, filter_name)
     if not isinstance(scene, mi.Scene) or not scene.sensors():
         raise RegressionError(f'"{path or "dictionary"}" is no scene with a sensor; expected one to render')
-    filter_of_scene, count = _filter_name(scene), len(scene.sensors())
+    # By the class that the filter prints: "BoxFilter[]" is "box".
+    filter_of_scene = str(scene.sensors()[0].film().rfilter()).partition("[")[0].removesuffix("Filter").lower()
+    count = len(scene.sensors())
     if isinstance(source, mi.Scene) and filter_name not in (None, filter_of_scene):
         raise RegressionError(
             f'the loaded scene has the reconstruction filter "{filter_of_scene}"; expected "{filter_name}", which '
@@ -162,11 +164,6 @@ def _replace_filter(state: mi.parser.ParserState, name: str) -> None:
             if properties.type(key) == mi.Properties.Type.ResolvedReference and properties[key].index() in filters:
                 del properties[key]
         properties["reconstruction_filter"] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
-
-
-def _filter_name(scene: mi.Scene) -> str:
-    """Name of the filter's plugin, by the class that the filter prints: "BoxFilter[]" is "box"."""
-    return str(scene.sensors()[0].film().rfilter()).partition("[")[0].removesuffix("Filter").lower()
 
 
 def _checksums(path: Path, state: mi.parser.ParserState) -> dict[str, str]:
