@@ -37,8 +37,7 @@ from mitsuba_subdivision.figures.fit import DIAGONAL, ball_cage, distances, in_f
 from mitsuba_subdivision.figures.normal_error import ZOOM_OFFSET, ZOOM_VALENCE, normals_by, offset_cage, panel_samples
 from mitsuba_subdivision.figures.output import write_figure
 from mitsuba_subdivision.figures.scenes import COLUMNS, HIGHEST, LOWEST, ROWS, quilt
-from mitsuba_subdivision.figures.staging import project, visible
-from mitsuba_subdivision.figures.user_cage import around_vertices, frame
+from mitsuba_subdivision.figures.staging import around_vertices, frame, project, visible
 from mitsuba_subdivision.regression.image import read_channels
 from mitsuba_subdivision.schemes import scheme_named
 from patches.closed_cages import torus

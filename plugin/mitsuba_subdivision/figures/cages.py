@@ -21,18 +21,21 @@ from ..variants import SceneNode
 from .output import FigureError, FigureOptions, panels, rows_of, show, write_figure
 from .staging import (
     edge_rods,
+    fitted,
+    in_ball,
+    limit_surface,
     load_stage,
     make_mesh,
     on_white,
     paint,
     project,
+    read,
     render,
     render_panels,
     staged,
     visible,
     visible_runs,
 )
-from .user_cage import fitted, in_ball, read
 
 LEVELS = 4
 # Of the ball that fills the picture, for cages of users.
@@ -65,25 +68,22 @@ def draw_subdivision(options: FigureOptions) -> list[Path]:
         regular = regular_elements(limit)
         share = area_share(limit, regular)
         options.report(f"level {level}: {cage.face_count} faces, {100 * share:.1f} % of the area regular")
-        pixels, scene = _render_cage(stage, cage, regular, options, f"level {level}")
+        scene = staged(stage, mesh=_polyhedron(cage, regular))
         t = cage.topology
         ends = cage.positions[t.face_vertices[[t.edge_half_edge, t.next[t.edge_half_edge]]]]
         along = np.linspace(0, 1, (EDGE_SEGMENTS >> level) + 1)[None, :, None]
         lines = (1 - along) * ends[0][:, None] + along * ends[1][:, None]
         points = np.concatenate([cage.positions[_is_extraordinary(t)], _centres(cage)[t.face_sizes != 4]])
-        _draw_cage(axis, scene, pixels, lines, points, 0.55 - 0.12 * level, options.resolution)
+        width = 0.55 - 0.12 * level
+        rendered.append(_draw_cage(axis, options, f"level {level}", scene, lines, points, width))
         axis.set(title=f"level {level}", xlabel=f"{100 * share:.{0 if share in (0, 1) else 1}f} % regular")
-        rendered.append(pixels)
     options.report("limit surface")
     bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(REGULAR)}}
-    shape = {"type": "subdivision", **limit.cage.as_properties(mi), "tessellation_rate": RATE, "bsdf": bsdf}
-    scene = staged(stage, surface=mi.load_dict(shape))
-    pixels = render(scene, options, "limit surface")
+    scene = staged(stage, surface=limit_surface(limit.cage, RATE, bsdf))
     lines = edge_curves(limit, t.edge_half_edge, EDGE_SEGMENTS >> (LEVELS - 1))
     points = edge_curves(limit, t.vertex_half_edge[_is_extraordinary(t)], 1)[:, 0]
-    _draw_cage(axes[-1], scene, pixels, lines, points, 0.17, options.resolution)
+    rendered.append(_draw_cage(axes[-1], options, "limit surface", scene, lines, points, 0.17))
     axes[-1].set(title="limit surface", xlabel=f"regular but for {counts.pop()} points")
-    rendered.append(pixels)
     return write_figure(options, "subdivision", figure, rendered, levels=LEVELS)
 
 
@@ -110,10 +110,8 @@ def area_share(surface: LimitSurface, elements: NDArray[np.bool_]) -> float:
     return float(area[elements[triangles.element]].sum() / area.sum())
 
 
-def _render_cage(
-    stage: mi.Scene, cage: ControlCage, regular: NDArray[np.bool_], options: FigureOptions, name: str
-) -> tuple[NDArray[np.float32], mi.Scene]:
-    """Render the cage as a polyhedron with flat faces; returns the pixels and the scene."""
+def _polyhedron(cage: ControlCage, regular: NDArray[np.bool_]) -> mi.Mesh:
+    """The cage with flat faces, which are grey unless they are regular."""
     t = cage.topology
     # Every face becomes a fan of triangles around its centre. Its vertices are its own, and have its normal.
     corners, centres = cage.positions[t.face_vertices], _centres(cage)
@@ -121,15 +119,13 @@ def _render_cage(
     normals = np.add.reduceat(cross, t.face_offsets[:-1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     half_edges = np.arange(t.half_edge_count)
-    mesh = make_mesh(
+    return make_mesh(
         np.concatenate([corners, centres]),
         np.stack([half_edges, t.next, t.half_edge_count + t.face], axis=1),
         {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "face_color"}},
         normals=np.concatenate([normals[t.face], normals]),
         face_colours=np.where(regular[:, None], REGULAR, IRREGULAR)[t.face],
     )
-    scene = staged(stage, mesh=mesh)
-    return render(scene, options, name), scene
 
 
 def _centres(cage: ControlCage) -> NDArray[np.float64]:
@@ -157,14 +153,15 @@ def _is_extraordinary(topology: Topology) -> NDArray[np.bool_]:
 
 def _draw_cage(
     axis: Axes,
+    options: FigureOptions,
+    name: str,
     scene: mi.Scene,
-    pixels: NDArray[np.float32],
     lines: NDArray[np.floating],
     points: NDArray[np.floating],
     width: float,
-    resolution: int,
-) -> None:
-    """Draw a rendered image, and the lines and points on its surface that the camera sees."""
+) -> NDArray[np.float32]:
+    """Render a scene, and draw the lines and points on its surface that the camera sees; returns the pixels."""
+    pixels, resolution = render(scene, options, name), options.resolution
     show(axis, on_white(pixels))
     runs = visible_runs(scene, lines, resolution)
     axis.add_collection(LineCollection(runs, colors="#14181c", linewidths=width, capstyle="round"))
@@ -172,6 +169,7 @@ def _draw_cage(
     axis.plot(*seen.T, "o", color="#d1432b", markersize=2, markeredgecolor="white", markeredgewidth=0.2)
     # The part of the square image that the surface fills.
     axis.set(xlim=(0, resolution), ylim=(0.84 * resolution, 0.13 * resolution))
+    return pixels
 
 
 # Panels of the figure of creases, and their titles.
@@ -208,8 +206,7 @@ def draw_creases(options: FigureOptions) -> list[Path]:
     stage = load_stage("creases", width=options.resolution, height=round(HEIGHT * options.resolution))
     scenes = {CAGE_TITLE: staged(stage, **_cage_shapes(cage))}
     for name, title in TITLES.items():
-        shape = {"type": "subdivision", **_tagged(cage, name).as_properties(mi), "tessellation_rate": CREASE_RATE}
-        scenes[title] = staged(stage, shape=mi.load_dict({**shape, "bsdf": MATERIAL}))
+        scenes[title] = staged(stage, shape=limit_surface(_tagged(cage, name), CREASE_RATE, MATERIAL))
     figure, axes = panels(options, *rows_of(options, len(scenes)))
     rendered = render_panels(options, axes, scenes.items())
     _draw_legend(axes[0, 0], cage)

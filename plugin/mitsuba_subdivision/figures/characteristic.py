@@ -27,8 +27,7 @@ from ..schemes import Scheme, scheme_named
 from ..schemes.domain import FloatArray, ParameterDomain, ParameterMap
 from ..surface import LimitSurface
 from .output import SERIES, FigureOptions, hide_frame, label_powers, panels, write_figure
-from .staging import grid_points
-from .user_cage import around_vertices, frame
+from .staging import around_vertices, frame, grid_points
 
 # Points along each side of a polygon, which the map bends.
 SIDE_POINTS = 24

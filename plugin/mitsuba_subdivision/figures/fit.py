@@ -5,7 +5,6 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -26,8 +25,8 @@ from ..schemes.domain import FloatArray
 from ..shapes.derivatives import loss_of_views
 from ..surface import LimitSurface
 from ..variants import SceneNode, threads_set
-from .output import BETWEEN, SERIES, FigureError, FigureOptions, panels, show, write_figure
-from .staging import camera_matrix, edge_rods, in_8_bits, load_stage, make_mesh, project, render, staged
+from .output import BETWEEN, SERIES, FigureError, FigureOptions, panels, write_figure
+from .staging import camera_matrix, edge_rods, limit_surface, load_stage, make_mesh, project, render_panels, staged
 
 # Of all fits: steps, pictures, their pixels, samples, and samples of the pictures that are fitted to.
 STEPS, CREASE_STEPS = 100, 100
@@ -87,9 +86,8 @@ LABELS = {"cage": "cage", "refined": "coarse to fine", "mesh": "dense mesh"}
 # Behind numbers, as dark as the backdrop.
 LABEL = "#343d46"
 
-# A title of two lines, and shapes to be rendered; and a title with pixels.
+# A title of two lines, and shapes to be rendered.
 Panel = tuple[str, SceneNode]
-Picture = tuple[str, NDArray[np.float32]]
 # A box and the sharpness of its edges, those of `cube` in their order.
 Box = tuple[ControlCage, NDArray[np.float64]]
 # The course of a fit: the loss before each step, and cages or triangles of a mesh after some steps.
@@ -112,24 +110,24 @@ def draw(options: FigureOptions) -> list[Path]:
         courses["mesh"] = _fit_mesh(views)
         options.report(f"{CREASE_STEPS} steps with creases")
         boxes, sharpness = _fit_creases()
-    _, of_balls = _rendered(_ball_panels(shape, courses), BALL_VIEW, options)
-    sensor, of_boxes = _rendered(_box_panels(boxes), BOX_VIEW, options)
 
     # Twelve panels: pictures of the ball and of the box, in rows that plots of their fits complete.
     is_page = options.width >= BETWEEN
     figure, axes = panels(options, *((3, 4) if is_page else (4, 3)))
-    left = list(axes.flat)
+    of_balls, of_boxes, left = _ball_panels(shape, courses), _box_panels(boxes), list(axes.flat)
     box_axes = [left.pop(len(of_balls) + 2 * is_page) for _ in of_boxes]
     *ball_axes, losses, distances, course_of_sharpness = left
-    for axis, (title, pixels) in zip((*ball_axes, *box_axes), (*of_balls, *of_boxes), strict=True):
-        show(axis, in_8_bits(pixels), *title.split("\n", 1))
+    rendered = []
+    for shown, its_axes, view in ((of_balls, ball_axes, BALL_VIEW), (of_boxes, box_axes, BOX_VIEW)):
+        stage = load_stage("fit", resolution=options.resolution, field_of_view=view)
+        scenes = ((title, staged(stage, **shapes)) for title, shapes in shown)
+        rendered += render_panels(options, np.array(its_axes), scenes)
     for axis, box in zip(box_axes, boxes, strict=True):
-        _label(axis, sensor, *box)
+        _label(axis, stage.sensors()[0], *box)
     _plot_courses(losses, distances, shape, courses)
     _plot_sharpness(course_of_sharpness, boxes[0][1], sharpness)
     figure.legend(*distances.get_legend_handles_labels(), loc="outside lower center", ncols=3 if is_page else 2)
     titles = [title.replace("\n", ", ") for title, _ in (*of_balls, *of_boxes)]
-    rendered = [pixels for _, pixels in (*of_balls, *of_boxes)]
     return write_figure(options, "fit", figure, rendered, pictures=titles)
 
 
@@ -248,10 +246,9 @@ def _fit_creases() -> tuple[list[Box], NDArray[np.float64]]:
         return ControlCage(positions, cube().face_vertices.reshape(-1, 4), creases=creases)
 
     start, target = box((1, 1, 1), sharpness[0]), box(SIDES, truth)
-    shape = {"type": "subdivision", **target.as_properties(mi), "tessellation_rate": BOX_RATE, "bsdf": GREY}
     fit = CageFit(
         start,
-        _views_of(mi.load_dict(shape), BOX_PIXELS),
+        _views_of(limit_surface(target, BOX_RATE, GREY), BOX_PIXELS),
         {**LIGHTS, "integrator": integrator(SPP, EDGE_SPP)},
         shape={"bsdf": GREY, "tessellation_rate": BOX_RATE},
         learning_rate=[(0, BOX_RATES[0]), (CREASE_STEPS, BOX_RATES[1])],
@@ -281,16 +278,6 @@ def distances(target: ControlCage, cages: Sequence[ControlCage]) -> NDArray[np.f
     return np.array(measured)
 
 
-def _rendered(shown: Sequence[Panel], field_of_view: float, options: FigureOptions) -> tuple[Any, list[Picture]]:
-    """The camera, and renders of panels by their titles."""
-    stage = load_stage("fit", resolution=options.resolution, field_of_view=field_of_view)
-    pictures = []
-    for title, shapes in shown:
-        options.report(title.replace("\n", ", "))
-        pictures.append((title, render(staged(stage, **shapes), options, title.split("\n")[0])[..., :3]))
-    return stage.sensors()[0], pictures
-
-
 def _ball_panels(shape: ControlCage, courses: Mapping[str, Course]) -> list[Panel]:
     """Panels of the first row: the target, the refined cage on its way, and the dense mesh."""
     cages, mesh = courses["refined"][1], courses["mesh"][1][STEPS]
@@ -304,13 +291,9 @@ def _ball_panels(shape: ControlCage, courses: Mapping[str, Course]) -> list[Pane
     shown: list[Panel] = [(f"target\nseen in\n{VIEWS} pictures", as_mesh(shape))]
     for step in (0, *(min(cages, key=lambda step: abs(step - part * STEPS)) for part in SHOWN), STEPS):
         name = "start" if step == 0 else "result" if step == STEPS else "on the way"
-        surface_and_edges = {"surface": _surface(cages[step]), "rods": _rods(cages[step])}
+        surface_and_edges = {"surface": limit_surface(cages[step], RATE, CLAY), "rods": _rods(cages[step])}
         shown.append((title(name, step, cages[step]), surface_and_edges))
     return [*shown, (title("dense mesh", STEPS, mesh), as_mesh(mesh))]
-
-
-def _surface(cage: ControlCage) -> mi.Shape:
-    return mi.load_dict({"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": RATE, "bsdf": CLAY})
 
 
 def _rods(cage: ControlCage) -> mi.Shape:
@@ -331,7 +314,9 @@ def _box_panels(boxes: Sequence[Box]) -> list[Panel]:
     for title, (cage, sharpness) in zip((*titles, last), boxes, strict=True):
         # Rods are thicker, and of another colour, where creases are sharper.
         looks = [(_sharpness_colour(value), CREASE_RADIUS + CREASE_GROWTH * value) for value in sharpness.tolist()]
-        shown.append((title, {"surface": _surface(cage), **edge_rods(cage, cube().edges, sharpness, looks)}))
+        shown.append(
+            (title, {"surface": limit_surface(cage, RATE, CLAY), **edge_rods(cage, cube().edges, sharpness, looks)})
+        )
     return shown
 
 

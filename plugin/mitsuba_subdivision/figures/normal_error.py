@@ -31,8 +31,18 @@ from .cages import edge_curves
 from .characteristic import patch_of_valence
 from .output import BETWEEN, SERIES, FigureError, FigureOptions, label_powers, panels, scientific, show, write_figure
 from .peers import osd_peer, osd_samples
-from .staging import grid_points, grid_triangles, in_8_bits, load_stage, make_mesh, project, render, staged
-from .user_cage import around_vertices, frame
+from .staging import (
+    around_vertices,
+    frame,
+    grid_points,
+    grid_triangles,
+    in_8_bits,
+    load_stage,
+    make_mesh,
+    project,
+    render,
+    staged,
+)
 
 # Vertices within this radius of the extraordinary vertex show their normals, as needles of this length.
 NEEDLE_RADIUS = 0.3

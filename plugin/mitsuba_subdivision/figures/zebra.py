@@ -22,9 +22,12 @@ from ..surface import LimitSurface
 from .output import FigureOptions, hide_frame, panels, show, write_figure
 from .peers import blender, blender_mesh, osd_peer, osd_samples
 from .staging import (
+    around_vertices,
     camera_matrix,
+    frame,
     grid_points,
     grid_triangles,
+    limit_surface,
     load_stage,
     make_mesh,
     on_white,
@@ -33,7 +36,6 @@ from .staging import (
     split_quads,
     staged,
 )
-from .user_cage import around_vertices, frame
 
 # Level of the refined mesh, as programs without limit surfaces render it.
 LEVEL = 3
@@ -74,12 +76,14 @@ def draw(options: FigureOptions) -> list[Path]:
         surface, level, at = LimitSurface(cage), OWN_LEVEL, (0, 0)
     shapes, titles = _shapes(surface.cage, level)
     stripes = _stripes(stage.sensors()[0], STRIPES)
-    pixels, normals = {}, {}
+    # Shading normals where a few rays of each pixel hit, (rays, height, width, 3).
+    aov, pixels, normals = mi.load_dict({"type": "aov", "aovs": "normal:sh_normal"}), {}, {}
     for name, shape in shapes.items():
         options.report(f"reflection lines: {name}")
         scene = staged(stage, shape=shape, stripes=stripes)
         pixels[name] = render(scene, options, f"reflection lines: {name}")
-        normals[name] = _pixel_normals(scene)
+        rays = [render_pixels(scene, seed, 1, integrator=aov)[..., -3:] for seed in range(NORMAL_RAYS)]
+        normals[name] = np.array(rays, dtype=np.float64)
     # All surfaces get the same rays. The median leaves out a ray that slips between two triangles.
     exact = normals.pop("exact")
     angles = {name: np.median(np.nan_to_num(normal_angle(exact, n)), axis=0) for name, n in normals.items()}
@@ -107,8 +111,7 @@ def draw(options: FigureOptions) -> list[Path]:
 
 def _shapes(cage: ControlCage, level: int) -> tuple[dict[str, Any], dict[str, tuple[str, str]]]:
     """Mirrors by name, the exact one first; and their titles: who made the surface, and how."""
-    properties = {**cage.as_properties(mi), "tessellation_rate": 2**level}
-    exact, refined = mi.load_dict({"type": "subdivision", **properties, "bsdf": MIRROR}), cage
+    exact, refined = limit_surface(cage, 2**level, MIRROR), cage
     for _ in range(LEVEL):
         refined = refined.refined()
     quads = refined.face_vertices.reshape(-1, 4)[~refined.is_hole]
@@ -162,10 +165,3 @@ def _stripes(sensor: mi.Sensor, count: int) -> mi.Emitter:
     turn[:3, :3] = np.stack([sin * x - cos * y, cos * x + sin * y, z], axis=1)
     bitmap = mi.Bitmap(bands.astype(np.float32))
     return mi.load_dict({"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(turn.tolist())})
-
-
-def _pixel_normals(scene: mi.Scene) -> NDArray[np.float64]:
-    """Shading normals where a few rays of each pixel hit: ``(rays, height, width, 3)``."""
-    integrator = mi.load_dict({"type": "aov", "aovs": "normal:sh_normal"})
-    rays = [render_pixels(scene, seed, 1, integrator=integrator)[..., -3:] for seed in range(NORMAL_RAYS)]
-    return np.array(rays, dtype=np.float64)
