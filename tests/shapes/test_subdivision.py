@@ -120,8 +120,8 @@ def test_filename_is_relative_to_the_scene_and_a_missing_file_an_error_that_name
 @scalar
 def test_a_mesh_of_a_usd_file_with_its_scheme(tmp_path):
     pytest.importorskip("pxr")
-    text, four_sided = "#usda 1.0\n", tetrahedron()
-    for name, scheme, cage in (("cube", "catmullClark", cube()), ("tetrahedron", "loop", four_sided)):
+    text, pyramid = "#usda 1.0\n", tetrahedron()
+    for name, scheme, cage in (("cube", "catmullClark", cube()), ("tetrahedron", "loop", pyramid)):
         start, end = ([tuple(point) for point in (cage.positions + shift).tolist()] for shift in (0, [0, 0, 4]))
         text += f"""def Mesh "{name}" {{
             uniform token subdivisionScheme = "{scheme}"
@@ -134,7 +134,7 @@ def test_a_mesh_of_a_usd_file_with_its_scheme(tmp_path):
     given = {"type": "subdivision", "filename": str(tmp_path / "cages.usda")}
     shape = mi.load_dict({**given, "prim": "/tetrahedron", "time": 1.0})
     assert 'scheme = "loop"' in str(shape)
-    np.testing.assert_allclose(buffer(shape, "control_points"), np.add(tetrahedron.positions, [0, 0, 2]), atol=SINGLE)
+    np.testing.assert_allclose(buffer(shape, "control_points"), np.add(pyramid.positions, [0, 0, 2]), atol=SINGLE)
     for parameters, message in (
         (given, "there are 2 meshes; expected prim to name one of /cube, /tetrahedron"),
         ({**given, "prim": 3}, 'parameter "prim" is 3; expected a string'),
