@@ -130,10 +130,7 @@ def child_rows(
 ) -> tuple[NDArray[np.int64], FloatArray]:
     """Compute the factors that all forms share: ``bᵀ P_k Ā``, ``2 s_k b_uᵀ P_k Ā`` and so on, the rows of level 0.
 
-    Returns
-    -------
-    level : (s,) int64
-    rows : (3, s, K) or (6, s, K)
+    Returns the level of each sample, (s,) int64, and rows, (3, s, K) or (6, s, K).
     """
     level, child, local = locate(scheme.domain, uv)
     rows = np.empty((3 * derivatives, len(uv), tables.shape[2]), dtype=tables.dtype)
@@ -178,12 +175,7 @@ def stam_rows(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasis) -> 
 def stabilized_rows(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasis) -> tuple[FloatArray, FloatArray]:
     """Apply equations (10) and (12), over the eigen-coordinates: ``bᵀ P_k Ā v_i`` times ``(λ_i / λ_2)ⁿ``.
 
-    Returns
-    -------
-    rows : (3, s, K) or (6, s, K)
-        Derivatives without the factors ``(2 λ_2)ⁿ`` and ``(4 λ_2)ⁿ``.
-    derivative_scale : (2, s)
-        These factors.
+    Returns rows whose derivatives lack the factors ``(2 λ_2)ⁿ`` and ``(4 λ_2)ⁿ``, and these factors, (2, s).
     """
     lambda_2 = rows.dtype.type(basis.subdominant)
     occurring, which = distinct_levels(level)

@@ -73,17 +73,6 @@ class LocatedSamples:
 
     Raises SchemeError if refinement does not separate the irregularities of a one-ring, or a feature always stays
     semi-sharp.
-
-    Attributes
-    ----------
-    leaf_sample : (s,) int64
-        Number of each sample, counted through all `leaves`.
-    path : (s,) int64
-        Numbers of the children that contain each sample, as digits in base four below a leading one; the least
-        significant digit is the child of the element. Two samples of an element lie in the same leaf if their paths are
-        equal.
-    jacobian : (2, 2, s) float64
-        Derivatives of the leaf's parameters by the sample's (u, v).
     """
 
     def __init__(
@@ -96,7 +85,12 @@ class LocatedSamples:
         corner: IntArray,  # (s,) int64: corner of the element at which (u, v) is (0, 0)
     ) -> None:
         self.scheme, self._given = scheme, (elements, element, uv, corner)
-        self.path, self.leaf_sample = (np.zeros(len(uv), dtype=np.int64) for _ in range(2))
+        # Numbers of the children that contain each sample, as digits in base four below a leading one; the least
+        # significant digit is the child of the element. Two samples of an element lie in the same leaf if these are
+        # equal.
+        self.path = np.zeros(len(uv), dtype=np.int64)
+        # Number of each sample, counted through all `leaves`
+        self.leaf_sample = np.zeros(len(uv), dtype=np.int64)
         self._depths: list[list[_Node]] = []
         domain, uv, speed, leaf_turn = scheme.domain, uv.copy(), np.ones(len(uv)), corner.copy()
         in_leaves: dict[IrregularPatch | None, list[tuple[int, int, Piece, IntArray]]] = {}
@@ -141,6 +135,7 @@ class LocatedSamples:
         matrices, offsets = zip(*(domain.rotation(turn) for turn in range(domain.corner_count)), strict=True)
         rotation: FloatArray = np.stack(matrices, axis=-1).take(leaf_turn, axis=-1)
         uv = (rotation[:, 0] * uv[:, 0] + rotation[:, 1] * uv[:, 1] + np.stack(offsets, -1).take(leaf_turn, -1)).T
+        # (2, 2, s) float64: derivatives of the leaf's parameters by the sample's (u, v)
         self.jacobian = rotation * speed
         self.leaves, begin = list[Leaves](), 0
         for patch, rows in in_leaves.items():
@@ -160,18 +155,14 @@ class LocatedSamples:
         """Return `Leaves.rows` of all `leaves`."""
         return [leaves.rows(self.scheme, evaluator, dtype, derivatives) for leaves in self.leaves]
 
-    def weights(self, of_leaves: Sequence[FloatArray], *, power: bool = False) -> list[FloatArray]:
-        """Transform rows of leaves into weights over the one-rings of the elements.
-
-        Returns list of (s_element, d, K) float64: one array for each element.
-
-        Parameters
-        ----------
-        of_leaves : sequence of (d, n, K_leaf)
-            Rows of the samples of each of the `leaves`, over eigen-coordinates, or control points of regular patches.
-        power : bool
-            Whether rows of irregular patches are over control points, too.
-        """
+    def weights(
+        self,
+        # (d, n, K_leaf) for each of the `leaves`: rows over eigen-coordinates, or control points of regular patches
+        of_leaves: Sequence[FloatArray],
+        *,
+        power: bool = False,  # Whether rows of irregular patches are over control points, too
+    ) -> list[FloatArray]:
+        """Transform rows of leaves into weights over the one-rings: (s_element, d, K) float64 for each element."""
         size = len(of_leaves[0]) if of_leaves else 0
         in_leaf: list[dict[int, FloatArray]] = [{} for _ in self._depths]
         for leaves, leaf_rows in zip(self.leaves, of_leaves, strict=True):
@@ -238,15 +229,12 @@ def by_uv(tangents: FloatArray, jacobian: FloatArray) -> FloatArray:
 
 
 def limit_stencils(located: LocatedSamples) -> list[FloatArray]:
-    """Compute limit stencils of samples over the one-rings of their elements.
+    """Compute limit stencils of samples over the one-rings of their elements: (s_element, 3, K) float64 for each.
 
-    Returns
-    -------
-    list of (s_element, 3, K) float64
-        For each element, weights of the point, which sum to one, and of two tangents, which sum to zero. The cross
-        product of the tangents is along the normal, also at extraordinary points. Away from extraordinary points,
-        borders and sharp features, the tangents are the derivatives times a positive factor, which may differ between
-        samples. They are zero where the surface is folded for all control points.
+    These are weights of the point, which sum to one, and of two tangents, which sum to zero. The cross product of the
+    tangents is along the normal, also at extraordinary points. Away from extraordinary points, borders and sharp
+    features, the tangents are the derivatives times a positive factor, which may differ between samples. They are zero
+    where the surface is folded for all control points.
     """
     rows = located.rows("stabilized", np.float64, 1)
     stencils = located.weights([np.concatenate([leaf_rows.rows[:1], leaf_rows.tangents]) for leaf_rows in rows])

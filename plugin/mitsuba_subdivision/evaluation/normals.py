@@ -47,14 +47,10 @@ def unit_normals(
 ) -> FloatArray:
     """Compute unit vectors along the cross products of pairs of tangents of any length.
 
-    Coordinates are along the axis before samples, as operations along a last axis of length three are slow.
-
-    Returns
-    -------
-    (3, ...)
-        Zero where the cross product is zero. With weights and extent, also zero where the cross product is within its
-        rounding error, as the surface is folded or collapses to a curve or a point. The error is bounded for each
-        coordinate separately, so tangents may have very different lengths, and very thin cages have normals.
+    Coordinates are along the axis before samples, as operations along a last axis of length three are slow. Vectors are
+    zero where the cross product is zero. With weights and extent, they are also zero where it is within its rounding
+    error, as the surface is folded or collapses to a curve or a point. The error is bounded for each coordinate
+    separately, so tangents may have very different lengths, and very thin cages have normals.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
         longest = np.maximum(np.abs(tangents).max(axis=1), LEAST_LENGTH[8 * tangents.dtype.itemsize])

@@ -34,15 +34,10 @@ class BernsteinBasis:
 
     A tensor product over the unit square, and the basis of the total degree over the unit triangle. The functions are
     non-negative and sum to one, so a polynomial's values lie in the convex hull of its coefficients [Farin 2002].
-
-    Parameters
-    ----------
-    degree : int
-        Degree in each of u and v over the square, total degree over the triangle.
     """
 
     domain: ParameterDomain
-    degree: int
+    degree: int  # In each of u and v over the square, total degree over the triangle
 
     @cached_property
     def indices(self) -> IntArray:
