@@ -9,7 +9,7 @@ import pytest
 from mitsuba_subdivision.cage.errors import CageError, CageWarning, warn
 from mitsuba_usd.contents import NodeContents, PrimvarContents, TextureContents
 from mitsuba_usd.stage_walk import StageReader
-from pxr import Sdf
+from pxr import Sdf, Usd
 from usd.stages import SQUARE, bound, camera, mesh, moved, prim, shader, told, write
 
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
@@ -289,7 +289,9 @@ def test_packages_hold_documents_and_their_pictures(tmp_path):
     (tmp_path / "red.mtlx").write_text(document(given("base_color", "color3", nodename="i"), graph=image))
     write(tmp_path, looks("looks/red.mtlx") + SMOOTH_SQUARE)
     package = tmp_path / "all.usdz"
-    with Sdf.ZipFileWriter.CreateNew(str(package)) as archive:
+    # Until USD 25 it was a class of `Usd`.
+    writer = Sdf.ZipFileWriter if hasattr(Sdf, "ZipFileWriter") else Usd.ZipFileWriter
+    with writer.CreateNew(str(package)) as archive:
         for name in ("stage.usda", "looks/red.mtlx", "tex/color.png"):
             archive.AddFile(str(tmp_path / name.rpartition("/")[2]), name)
     assert material(package).inputs["base_color"].file == f"{package}[tex/color.png]"
