@@ -41,7 +41,7 @@ def main(task, obj, binary, rate, repeats, variant):
 def total(_obj, binary, rate, _variant, _folder):
     """From a cage in memory to points and normals in memory, and again after control points moved."""
     from drjit.llvm.ad import Float
-    from mitsuba_subdivision.kernels import VertexKernel
+    from mitsuba_subdivision.kernels.vertex_kernel import VertexKernel
 
     positions, quads = read_bin(binary)
 
@@ -63,7 +63,7 @@ def total(_obj, binary, rate, _variant, _folder):
 
 def stages(obj, binary, rate, _variant, _folder):
     from drjit.llvm.ad import Float
-    from mitsuba_subdivision.kernels import VertexKernel
+    from mitsuba_subdivision.kernels.vertex_kernel import VertexKernel
     from mitsuba_subdivision.mesh.connectivity import Topology
 
     positions, quads = read_bin(binary)

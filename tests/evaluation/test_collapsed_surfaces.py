@@ -8,7 +8,7 @@ from evaluation.common import evaluate_from
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
-from mitsuba_subdivision.kernels import VertexKernel
+from mitsuba_subdivision.kernels.vertex_kernel import VertexKernel
 from patches.closed_cages import cube_with_valence_2
 from reference.exact_samples import angle, bumpy
 from reference.refined_cages import refine_first, tagged

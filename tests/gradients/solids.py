@@ -8,7 +8,7 @@ normal.
 
 import drjit as dr
 import numpy as np
-from mitsuba_subdivision.kernels import VertexKernel
+from mitsuba_subdivision.kernels.vertex_kernel import VertexKernel
 from mitsuba_subdivision.patches import SurfacePieces
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))

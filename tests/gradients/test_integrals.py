@@ -8,8 +8,8 @@ import pytest
 from gradients import solids
 from gradients.surfaces import CLOSED, motions, moved
 from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.kernels import VertexKernel
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
+from mitsuba_subdivision.kernels.vertex_kernel import VertexKernel
 from mitsuba_subdivision.llvm import llvm_problem
 from reference.refined_cages import sheet, tagged
 

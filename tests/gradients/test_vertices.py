@@ -6,8 +6,7 @@ import drjit as dr
 import numpy as np
 import pytest
 from gradients.surfaces import ALL
-from mitsuba_subdivision.kernels import VertexKernel
-from mitsuba_subdivision.kernels.vertex_kernel import placed
+from mitsuba_subdivision.kernels.vertex_kernel import VertexKernel, placed
 from mitsuba_subdivision.llvm import llvm_problem
 from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
 

@@ -9,9 +9,8 @@ import pytest
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.device_arrays import upload
-from mitsuba_subdivision.kernels import VertexKernel
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
-from mitsuba_subdivision.kernels.vertex_kernel import UnitNormal
+from mitsuba_subdivision.kernels.vertex_kernel import UnitNormal, VertexKernel
 from patches.closed_cages import bumpy, mixed_torus, torus
 from reference.refined_cages import refine_first, tagged
 

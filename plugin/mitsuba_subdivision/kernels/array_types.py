@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from ..device_arrays import mapped
 from ..llvm import require_llvm
-from ..mesh.shared import Content, Shared, SharedArray
 
 # A real number: a parameter u or v, a distance, a weight.
 Float = Any
@@ -42,7 +41,6 @@ Ray = Any
 
 # Mode of scatters to distinct indices. With other modes, Dr.Jit runs a kernel before each further scatter to an array.
 NO_CONFLICTS = dr.ReduceMode.NoConflicts
-_UPLOADED: Shared[SharedArray] = Shared()
 
 # Arrays that each thread has computed, by `LaterArrays`.
 _of_thread = threading.local()
@@ -97,11 +95,6 @@ class ArrayTypes:
     def floats(self, values: NDArray[np.floating]) -> FloatBuffer:
         """Upload an array of numbers, flattened."""
         return mapped(self.float, values)
-
-    def shared_floats(self, values: NDArray[np.floating]) -> SharedArray:
-        """Upload an array of numbers, flattened. Equal arrays share their memory while one is referenced."""
-        # Copied to memory of Dr.Jit, as frozen functions may replace the array.
-        return _UPLOADED.get((self.float, Content(values)), lambda: SharedArray(dr.opaque(self.floats(values))))
 
     def converted(self, kind: type, values: Any) -> Any:
         """Convert a user's values to one of these types; a NumPy array of vectors has a row for each component."""

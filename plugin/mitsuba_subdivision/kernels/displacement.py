@@ -91,8 +91,8 @@ class Displacement:
 
     def variables(self) -> list:
         """Arrays that the displacement is differentiable with respect to."""
-        values = [self.channel.values.flat] if self.channel.values.are_moving else []
-        return [self.scale, *values, *self.heights.variables()]
+        values = self.channel.values.flat
+        return [self.scale, *([values] if dr.grad_enabled(values) else []), *self.heights.variables()]
 
     def piece(self, surface: Piece, half_edge: Index, u: Float, v: Float, active: Mask) -> DisplacedPiece:
         """Displace the piece of the surface at a location."""

@@ -394,8 +394,3 @@ class ControlValues:
         # Dr.Jit compiles literals into kernels.
         dr.make_opaque(flat)
         self.flat[:] = flat
-
-    @property
-    def are_moving(self) -> bool:
-        """Whether the values are differentiated."""
-        return bool(dr.grad_enabled(self.flat))

@@ -25,11 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import warn
-from ..device_arrays import upload
-from ..kernels.array_types import ArrayTypes, Float, FloatBuffer, Index, Mask, Value
-from ..mesh.shared import SharedArray, shared
+from ..device_arrays import mapped, upload
+from ..kernels.array_types import Float, FloatBuffer, Index, Mask, Value
+from ..mesh.shared import Content, Shared, SharedArray, shared
 from ..variants import Variant
-from .derivatives import Watched, computed_ones, warn_of_lost
+from .derivatives import computed_ones, warn_of_lost, watched
 from .device_state import flat_type, require_values
 from .parameter_table import errors_about
 
@@ -52,6 +52,7 @@ _MARK, _WORD = 4, 4
 _BLACK, _WHITE = -8192.0, 8192.0
 # Lower bound of the largest component of a colour, by which the other components are divided.
 _DARKEST = 1e-6
+_UPLOADED: Shared[SharedArray] = Shared()
 
 
 class CageAttributes:
@@ -133,17 +134,17 @@ class CageAttributes:
     def buffers(self, names: Iterable[str] | None = None) -> dict[str, FloatBuffer]:
         """Mesh buffers of the given attributes, by default of all, by name of the buffer."""
         attributes = self._channels if names is None else names
-        return {mesh_name(name): self._stored(name) for name in attributes if name in self._loaded}
+        values = {name: self._at_vertices(name) for name in attributes if name in self._loaded}
+        values |= {name: self._upsampling[name].stored(values[name]) for name in values if name in self._upsampling}
+        return {mesh_name(name): of_vertices for name, of_vertices in values.items()}
 
     def _upload(self, values: NDArray[np.floating]) -> SharedArray:
         """Flat array of values; in JIT variants, meshes with equal values share it."""
-        if self._float is None:
+        kind = self._float
+        if kind is None:
             return SharedArray(values.ravel())
-        return ArrayTypes(self._float).shared_floats(values)
-
-    def _stored(self, name: str) -> FloatBuffer:
-        values = self._at_vertices(name)
-        return self._upsampling[name].stored(values) if name in self._upsampling else values
+        # Copied to memory of Dr.Jit, as frozen functions may replace the array.
+        return _UPLOADED.get((kind, Content(values)), lambda: SharedArray(dr.opaque(mapped(kind, values))))
 
     def _at_vertices(self, name: str) -> FloatBuffer:
         if name not in self._moved:
@@ -177,7 +178,7 @@ class CageAttributes:
     def _move(self, name: str) -> None:
         values = self.values[f"{PREFIX}{name}"]
         if dr.grad_enabled(values):
-            values = dr.custom(Watched, {name: values}, self._on_backward, (name,))[name]
+            values = watched({name: values}, self._on_backward, name)[name]
         self._moved[name] = values
         if name in self._followers:
             self._followers[name](values)

@@ -4,38 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
+from weakref import WeakMethod
 
 import drjit as dr
 import mitsuba as mi
 
 from ..cage.errors import warn
 from ..kernels.array_types import Float
+from ..kernels.linear_maps import attached
 from .device_state import is_recording
 
 # Number of bits of a Dr.Jit variable index. The index of its derivative is in the bits above.
 _HALF = 32
 
 
-class Watched(dr.CustomOp):
-    """Identity function of arrays, which calls a method after reverse mode has passed through it."""
+def watched(
+    arrays: dict[str, Any],  # Differentiated
+    method: WeakMethod,  # Weak, as the arrays must not keep the shape alive
+    *arguments: Any,
+) -> dict[str, Any]:
+    """The same arrays. Calls a method with gradients by name after reverse mode has passed through them."""
 
-    # The method's reference is weak, as the arrays must not keep the shape alive.
-    def eval(self, arrays, method, arguments):
-        self.method, self.arguments = method, arguments
-        # Copies, because Dr.Jit attaches derivatives to the returned arrays themselves.
-        return {name: type(array)(array) for name, array in arrays.items()}
+    def backward(*gradients: Any) -> tuple:
+        call = method()
+        if call is not None:
+            call(*arguments, dict(zip(arrays, gradients, strict=True)))
+        return gradients
 
-    def forward(self):
-        self.set_grad_out(self.grad_in("arrays"))
-
-    def backward(self):
-        gradients, method = self.grad_out(), self.method()
-        self.set_grad_in("arrays", gradients)
-        if method is not None:
-            method(*self.arguments, gradients)
-
-    def name(self):
-        return "Watched"
+    given = tuple(arrays.values())
+    through = attached(tuple(map(dr.detach, given)), given, lambda changes: changes, backward)
+    return dict(zip(arrays, through, strict=True))
 
 
 def warn_of_lost(

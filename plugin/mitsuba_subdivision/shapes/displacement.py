@@ -93,27 +93,24 @@ class ShapeDisplacement:
         if self.kernel is not None:
             channel = ChannelKernel(self._channel, variant.Float) if exact is None else exact.channels[self.attribute]
             self.kernel.displacement = Displacement(channel, self.heights, scale)
-        self.take_scale(self.checked_scale())
+        self.require_scale()
+        self.take_scale()
 
-    def checked_scale(self) -> float:
-        """The value of ``displacement_scale``; NaN while a frozen function is recorded, when it cannot be read.
-
-        Raises ValueError if it is not a finite number.
-        """
+    def require_scale(self) -> None:
+        """Raise ValueError if ``displacement_scale`` is not a finite number, unless it cannot be read."""
         if is_recording():
-            return np.nan
+            return
         values = np.array(self.scale).ravel()
         if len(values) != 1 or not np.isfinite(values[0]):
             raise ValueError(f"{values.tolist()} was given; expected a finite number")
-        return float(values[0])
 
-    def take_scale(self, checked: float) -> None:
-        """Apply ``displacement_scale``, whose `checked_scale` is ``checked``."""
+    def take_scale(self) -> None:
+        """Apply ``displacement_scale``."""
         if self._is_jit:
             # Dr.Jit compiles literals into kernels.
             dr.make_opaque(self.scale)
         # A copy, because users assign the parameter in place before it is checked.
-        self._scale = type(self.scale)(self.scale) if self._is_jit else checked
+        self._scale = type(self.scale)(self.scale)
         if self.kernel is not None and self.kernel.displacement is not None:
             self.kernel.displacement.scale = self._scale
 
@@ -146,16 +143,16 @@ class ShapeDisplacement:
 
     def bound(self) -> DisplacementBound:
         """Scaled heights as a function of the location, and their bound, for adaptive tessellation."""
-        return DisplacementBound(
-            self._heights_at, max(map(abs, self.heights.range(self.channel))) * abs(self.host_scale)
-        )
-
-    def _heights_at(self, start: IntArray, uv: FloatArray) -> FloatArray:
+        channel, scale = self.channel, self.host_scale
         float_type = type(self.scale) if self._is_jit else dr.scalar.ArrayXf64
-        columns = [mapped(float_type, column) for column in self.channel.evaluate(start, uv).T]
-        heights = self.heights.height(columns[0] if len(columns) == 1 else columns)
-        # A constant texture returns one number for all samples.
-        return np.broadcast_to(self.host_scale * np.array(heights, dtype=np.float64), len(uv))
+
+        def heights_at(start: IntArray, uv: FloatArray) -> FloatArray:
+            columns = [mapped(float_type, column) for column in channel.evaluate(start, uv).T]
+            heights = self.heights.height(columns[0] if len(columns) == 1 else columns)
+            # A constant texture returns one number for all samples.
+            return np.broadcast_to(scale * np.array(heights, dtype=np.float64), len(uv))
+
+        return DisplacementBound(heights_at, max(map(abs, self.heights.range(channel))) * abs(scale))
 
 
 def _attribute_named(given: str, surface: LimitSurface) -> str:

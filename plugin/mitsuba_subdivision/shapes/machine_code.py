@@ -258,15 +258,18 @@ def _installed(code: bytes, *used: Any) -> int:
 
     Raises OSError if the code and its unwind information are longer than a page.
     """
-    address = _writable_page()
-    code_and_unwind_info = code + _frame_description(address, len(code))
-    if len(code_and_unwind_info) > mmap.PAGESIZE:
-        raise OSError(f"machine code of {len(code_and_unwind_info)} bytes; expected at most a page of {mmap.PAGESIZE}")
+    address, size = _writable_page(), len(code)
+    # A common information entry, a frame description entry, and a terminator
+    common = struct.pack("<I", len(_COMMON)) + _COMMON
+    frame = struct.pack("<IQQ", len(common) + 4, address, size) + _FRAME
+    code += common + struct.pack("<I", len(frame)) + frame + bytes(4)
+    if len(code) > mmap.PAGESIZE:
+        raise OSError(f"machine code of {len(code)} bytes; expected at most a page of {mmap.PAGESIZE}")
     for reference in (*used, _fail):
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(reference))
-    ctypes.memmove(address, code_and_unwind_info, len(code_and_unwind_info))
+    ctypes.memmove(address, code, len(code))
     _protect(address, mmap.PROT_READ | mmap.PROT_EXEC)
-    bindings()["__register_frame"](ctypes.c_void_p(address + len(code)))
+    bindings()["__register_frame"](ctypes.c_void_p(address + size))
     return address
 
 
@@ -329,13 +332,6 @@ def _assembled(text: str, **values: int) -> bytes:
     for end, name in jumps:
         code[end - 4 : end] = struct.pack("<i", places[name] - end)
     return bytes(code)
-
-
-def _frame_description(address: int, size: int) -> bytes:
-    """Unwind information of a function: common information entry, frame description entry, and terminator."""
-    common = struct.pack("<I", len(_COMMON)) + _COMMON
-    description = struct.pack("<IQQ", len(common) + 4, address, size) + _FRAME
-    return common + struct.pack("<I", len(description)) + description + bytes(4)
 
 
 # Errors

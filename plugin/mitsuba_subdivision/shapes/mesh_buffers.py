@@ -17,12 +17,12 @@ from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared, SharedArray, shared
 from ..surface import TEXCOORDS, LimitSurface
 from ..variants import Variant
-from .derivatives import Watched, computed_ones, warn_of_lost
+from .derivatives import computed_ones, warn_of_lost, watched
 from .placement import Placement
 
 if TYPE_CHECKING:
-    from ..kernels import VertexKernel
     from ..kernels.surface_kernel import SurfaceKernel
+    from ..kernels.vertex_kernel import VertexKernel
     from ..tessellation.attribute_table import AttributeLayout, AttributeTable
     from ..tessellation.vertex_table import VertexTable
     from .displacement import DisplacedVertices, ShapeDisplacement
@@ -73,7 +73,7 @@ class MeshBuffers:
         self._is_sampled = parameters.evaluator != "stabilized" or parameters.sample_offset > 0
         self._kernel: VertexKernel | None = None
         if is_jit and not self._is_sampled:
-            from ..kernels import VertexKernel
+            from ..kernels.vertex_kernel import VertexKernel
 
             self._kernel = shared(VertexKernel, table, variant.Float)
         # Whether vertices are differentiable with respect to control points, placement and displacement.
@@ -196,7 +196,7 @@ class MeshBuffers:
         if self.are_differentiable:
             attached = {name: array for name, array in moved.items() if dr.grad_enabled(array)}
             if attached:
-                moved |= dr.custom(Watched, attached, self._on_backward, ())
+                moved |= watched(attached, self._on_backward)
         if shading is not None:
             shading.set_transform(moved.pop("to_world"), moved.pop("coefficients"), placement)
         return moved

@@ -19,11 +19,10 @@ from ..tessellation import HIGHEST_RATE
 if TYPE_CHECKING:
     import mitsuba as mi
 
-SHADINGS = ("vertex", "exact", "auto")
-
 # Parameters of a scene: name, type, default and flag, and a description with literals between double backticks. The
 # type is one of Mitsuba's documentation, several are joined by " or ". A name may contain ``NAME``, a placeholder for
-# an attribute's name. A default that is no single value is described. A parameter without a flag is read when the shape
+# an attribute's name. A default that is no single value is described. Other values that a string may have follow its
+# default; the cage checks its rules, which may also come from a file. A parameter without a flag is read when the shape
 # is loaded only.
 _PARAMETERS = f"""
 filename : string
@@ -96,7 +95,7 @@ strict : bool = false
     neighbours are reversed.
 tessellation_rate : int = 8
     Segments along each edge of the control cage, 1 to {HIGHEST_RATE}.
-tessellation : string = uniform
+tessellation : string = uniform | adaptive
     ``uniform``, or ``adaptive``: as few triangles as the limit allows, which is one of ``chord_error``, ``pixel_error``
     and ``max_edge``.
 chord_error : float; exposed
@@ -109,7 +108,7 @@ max_rate : int = 64
     Adaptive tessellation: most segments along an edge of the control cage, 1 to {HIGHEST_RATE}; rounded down to a power
     of two. Around extraordinary vertices, rings get as small as the limit needs, with at most half as many segments
     along each.
-outline : string = none
+outline : string = none | sensor
     Adaptive tessellation: with ``sensor``, the limit holds for triangles that the sensor may see edge-on; others may
     have up to 8 times the error. For exact shading.
 sensor_to_world : transform
@@ -121,7 +120,7 @@ film_width : int
     Width of its film in pixels.
 film_height : int
     Height of its film in pixels.
-shading : string = vertex
+shading : string = vertex | exact | auto
     ``vertex``: exact normals at the triangles' vertices, interpolated between them. ``exact``: position, normal,
     tangents, their derivatives, texture coordinates and attributes of the limit surface at every hit. ``auto``:
     ``exact`` in JIT variants where it works and without ``face_normals``, else ``vertex``.
@@ -130,7 +129,7 @@ displacement : texture or string
     attribute ``vertex_NAME`` of a cage's attribute with one number per value. (Default: none)
 displacement_scale : float; discontinuous
     Factor of the heights. (Default: 1)
-evaluator : string = stabilized
+evaluator : string = stabilized | stam
     ``stabilized``, or ``stam``: points and normals by Stam's form in single precision, which fails at extraordinary
     vertices; for comparison.
 sample_offset : float = 0
@@ -188,13 +187,6 @@ _TYPES: dict[str, tuple[type | tuple[type, ...], str, Callable[[str], Any]]] = {
     "float": ((float, int), "a number", float),
     "int": (int, "an integer", int),
     "bool": (bool, "true or false", lambda text: text == "true"),
-}
-# Values that a string may have. The cage checks its rules, which may also come from a file.
-_CHOICES = {
-    "tessellation": ("uniform", "adaptive"),
-    "outline": ("none", "sensor"),
-    "shading": SHADINGS,
-    "evaluator": ("stabilized", "stam"),
 }
 # Predicates for numbers of the right type, and descriptions of the numbers that they accept.
 _RATE = (lambda rate: 1 <= rate <= HIGHEST_RATE, f"1 to {HIGHEST_RATE} segments per edge")
@@ -303,7 +295,8 @@ def _parameter(entry: str) -> Parameter:
     """Read an entry of a table."""
     head, *lines = entry.splitlines()
     head, _, flag = head.partition("; ")
-    head, _, stated = head.partition(" = ")
+    head, *values = re.split(r" = | \| ", head)
+    stated = values[0] if values else ""
     name, kind = head.split(" : ")
     description, _, default_text = " ".join(map(str.strip, lines)).partition(" (Default: ")
     if stated:
@@ -315,7 +308,7 @@ def _parameter(entry: str) -> Parameter:
         _TYPES[kind][2](stated) if stated else None,
         default_text.removesuffix(")"),
         _FLAGS[flag],
-        _CHOICES.get(name, ()),
+        tuple(values) if len(values) > 1 else (),
         *_NUMBERS.get(name, (None, "")),
     )
 
@@ -324,6 +317,7 @@ PARAMETERS, STATE_PARAMETERS = (
     tuple(map(_parameter, re.split(r"\n(?=\S)", table.strip()))) for table in (_PARAMETERS, _STATE)
 )
 PARAMETER_OF_NAME = {parameter.name: parameter for parameter in PARAMETERS}
+SHADINGS = PARAMETER_OF_NAME["shading"].choices
 
 
 def value_of(props: mi.Properties, name: str) -> Any:

@@ -349,7 +349,7 @@ def cage_of_file(path: str, **options: Any) -> ControlCage:
     if file_format is None or file_format.refers_to_files or not is_settled:
         return ControlCage.from_file(path, **options)
     state = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
-    return _shared((path, *state, *sorted(options.items())), lambda: ControlCage.from_file(path, **options))
+    return _shared((path, *state, *sorted(options.items())), ControlCage.from_file, path, **options)
 
 
 def cage_of_arrays(name: str | None, **arguments: Any) -> ControlCage:
@@ -359,11 +359,10 @@ def cage_of_arrays(name: str | None, **arguments: Any) -> ControlCage:
     before.
     """
     if name is None:
-        return _shared(_digest(arguments), lambda: ControlCage.from_arrays(**arguments))
+        return _shared(_digest(arguments), ControlCage.from_arrays, **arguments)
     with without_warnings():
         # Equal cages with different names are shared, under the name of the first one.
-        source = CageSource(name)
-        return _shared(("named", _digest(arguments)), lambda: ControlCage.from_arrays(**arguments, source=source))
+        return _shared(("named", _digest(arguments)), ControlCage.from_arrays, **arguments, source=CageSource(name))
 
 
 def _digest(value: Any) -> Hashable:
@@ -377,21 +376,18 @@ def _digest(value: Any) -> Hashable:
     return value
 
 
-def _shared(key: Hashable, make: Callable[[], ControlCage]) -> ControlCage:
-    """Cage of a key, which may be shared. Warns as when the cage was made."""
-    noted: list[str] | None = None
+def _shared(key: Hashable, make: Callable[..., ControlCage], *arguments: Any, **options: Any) -> ControlCage:
+    """Cage of a key, which may be shared. Warns each time as when it was made."""
 
     def made() -> ControlCage:
-        nonlocal noted
-        with noting_warnings() as noted:
-            cage = make()
+        with noting_warnings() as noted, without_warnings():
+            cage = make(*arguments, **options)
         _WARNINGS[cage] = noted
         return cage
 
     cage = _CAGES.get(key, made)
-    if noted is None:
-        for message in _WARNINGS[cage]:
-            warn(message)
+    for message in _WARNINGS[cage]:
+        warn(message)
     return cage
 
 

@@ -99,8 +99,7 @@ class Placement:
 
     def relative(self, control_points: FloatBuffer) -> FloatBuffer:
         """Return flat control points relative to the centre."""
-        # The functions that use the points check their number.
-        if self.centre is None or len(control_points) != len(self._loaded):
+        if self.centre is None:
             return control_points
         moved = control_points - self._centres
         relative = dr.select(control_points == self._loaded, self._relative, moved)

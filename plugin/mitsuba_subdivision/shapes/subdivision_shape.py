@@ -191,7 +191,7 @@ def make_subdivision(
         def parameters_changed(self, keys: list[str]) -> None:
             keys = list(keys) or [*self._built, *_MOVING, *self._cage.values]
             # Check parameters before anything changes.
-            to_world, scale, tessellation = self._checked(keys)
+            to_world, tessellation = self._checked(keys)
             attributes = self._cage.update(keys)
             self._texture_scene = None
             if "faces" in keys:
@@ -202,8 +202,8 @@ def make_subdivision(
                 self._set_buffers(buffers)
                 super().parameters_changed([*keys, *buffers])
                 return
-            if self._displacement is not None and scale is not None:
-                self._displacement.take_scale(scale)
+            if self._displacement is not None and "displacement_scale" in keys:
+                self._displacement.take_scale()
             if "to_world" in keys:
                 self._placement.take(self.to_world, to_world)
             if tessellation is not self._tessellation:
@@ -231,11 +231,11 @@ def make_subdivision(
             # With the moved buffers among the keys, Mitsuba does not replace normals by averages of triangle normals.
             super().parameters_changed([*keys, *map(mesh_name, attributes), *_MOVED])
 
-        def _checked(self, keys: list[str]) -> tuple[NDArray[np.float64] | None, float | None, Tessellation]:
+        def _checked(self, keys: list[str]) -> tuple[NDArray[np.float64] | None, Tessellation]:
             """Check the parameters with the names ``keys``.
 
-            Returns the matrix of ``to_world`` and the scale of the displacement, None if they are not among these or
-            cannot be read, and the tessellation, another one if its limit is among these.
+            Returns the matrix of ``to_world``, None if it is not among these or cannot be read, and the tessellation,
+            another one if its limit is among these.
             """
             # Mitsuba reads as many values of vertex buffers that a user has assigned as before.
             names = [name for name in self._lengths if name in keys and name.startswith("vertex_")]
@@ -246,14 +246,14 @@ def make_subdivision(
             to_world = checked_matrix(self.to_world) if "to_world" in keys and not is_recording() else None
             if to_world is not None and bool(np.linalg.det(to_world[:3, :3]) < 0) != self._has_turned_faces:
                 self._require_unfrozen()
-            scale, tessellation = None, self._tessellation
+            tessellation = self._tessellation
             if "displacement_scale" in keys and self._displacement is not None:
                 with errors_about("displacement_scale"):
-                    scale = self._displacement.checked_scale()
+                    self._displacement.require_scale()
             if tessellation.limit in keys:
                 self._require_unfrozen()
                 tessellation = tessellation.with_error(np.array(self._error).ravel())
-            return to_world, scale, tessellation
+            return to_world, tessellation
 
         def _require_unfrozen(self) -> None:
             """Check that no frozen function has read the triangles, which are about to be replaced."""
@@ -278,7 +278,7 @@ def make_subdivision(
                 # `renew_attribute` receives the gradients next. Attaching vertices twice in one pass crashes Dr.Jit.
                 return
             with dr.resume_grad():
-                self._attach_vertices()
+                self._replace_gradients(self._mesh.attached(self.control_points))
 
         def renew_attribute(self, name: str, gradients: dict[str, FloatBuffer]) -> None:
             """Attach the arrays computed from an attribute's control values again; see `CageAttributes`."""
@@ -286,10 +286,7 @@ def make_subdivision(
                 self._cage.renew(name, gradients[name])
                 self._replace_gradients(self._cage.buffers([name]))
                 if self._mesh.are_differentiable and f"{PREFIX}{name}" in self._cage.moving:
-                    self._attach_vertices()
-
-        def _attach_vertices(self) -> None:
-            self._replace_gradients(self._mesh.attached(self.control_points))
+                    self._replace_gradients(self._mesh.attached(self.control_points))
 
         def _replace_gradients(self, buffers: dict[str, FloatBuffer]) -> None:
             """Attach the mesh's buffers to the graphs of ``buffers``, unless a user has assigned them since."""
