@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .contents import Input, MaterialContents, NodeContents, PrimvarContents, TextureContents
+from .contents import Input, MaterialContents, NodeContents, PrimvarContents
 from .materialx_nodes import constant, is_all, is_constant, node, node_of
 
 Given = Callable[[str], Input]
@@ -245,8 +245,6 @@ def number_mixed(background: Input, foreground: Input, amount: Input) -> Input:
 
 def luminance(color: Input) -> Input:
     """Luminance of a colour as a number."""
-    if isinstance(color, TextureContents) and len(color.channel) == 1:
-        return color
     return node("extract", "float", in_=node("luminance", "color3", in_=color), index=0.0)
 
 

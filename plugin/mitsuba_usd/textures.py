@@ -84,10 +84,12 @@ class Textures:
 
     def normals(self, given: TextureContents | NodeContents) -> SceneNode | None:
         """A texture of normals as Mitsuba has them, from 0 to 1; None if the picture cannot be read."""
+        if isinstance(given, NodeContents):
+            values, to_uv, wrap = self._baked(given)
+            return self._bitmap((values + 1) / 2, to_uv, wrap, is_raw=True)
         halved = node("add", "vector3", in1=node("multiply", "vector3", in1=given, in2=0.5), in2=0.5)
-        if isinstance(halved, NodeContents):
-            return self._bitmap(*self._baked(halved), is_raw=True)
-        if not isinstance(halved, TextureContents) or (picture := self._picture(halved.file, halved)) is None:
+        picture = self._picture(given.file, given)
+        if picture is None or not isinstance(halved, TextureContents):
             return None
         return self._plain(halved, picture, is_raw=True)
 
