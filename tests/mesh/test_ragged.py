@@ -22,3 +22,12 @@ def test_offsets_have_the_type_that_is_asked_for():
     assert ragged.offsets(np.array([1, 2]), np.int32).dtype == np.int32
     # One number with stride 0, as the sizes of faces that are all alike.
     np.testing.assert_array_equal(ragged.offsets(np.broadcast_to(np.int64(4), 3), np.int32), [0, 4, 8, 12])
+
+
+@pytest.mark.parametrize("lengths", [[], [5], [1] * 10, [3, 0, 9, 2, 2, 0, 0, 4]])
+def test_runs_cover_all_rows_in_order_and_are_no_longer_than_asked_but_for_one_row(lengths):
+    runs = ragged.runs_of(lengths, 4)
+    assert [index for run in runs for index in range(*run.indices(len(lengths)))] == list(range(len(lengths)))
+    for run in runs:
+        assert lengths[run]
+        assert sum(lengths[run]) - lengths[run][0] < 4

@@ -79,7 +79,7 @@ class DividedTile:
         """
         if self._element is None:
             return np.empty((4, 0), dtype=np.int64)
-        t = one_ring(self._element.signature.smoothed).topology
+        t = one_ring(self._element.signature).topology
         a, b, c, d = t.face_vertices[t.face_offsets[:-1] + np.arange(4)[:, None] * t.face_sizes // 4]
         return np.stack([a, c, b, d])
 

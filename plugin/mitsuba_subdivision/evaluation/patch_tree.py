@@ -20,6 +20,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray, VertexRule
 from ..mesh.one_ring import one_ring
 from ..mesh.sharpness import INFINITE
@@ -195,9 +196,8 @@ def divide(elements: Iterable[PatchTree]) -> None:
     Raises SchemeError if the scheme divides domains differently from `ParameterDomain.children`.
     """
     undivided = [element for element in dict.fromkeys(elements) if element.piece is None and not element._children]
-    runs = np.cumsum([element.control_count for element in undivided]) // JOINED_CONTROLS
-    for run in np.split(np.arange(len(undivided)), np.flatnonzero(np.diff(runs)) + 1) if undivided else ():
-        scheme, in_run = undivided[0].scheme, [undivided[index] for index in run]
+    for run in ragged.runs_of([element.control_count for element in undivided], JOINED_CONTROLS):
+        scheme, in_run = undivided[0].scheme, undivided[run]
         of_run = refined_children(scheme, [element.signature for element in in_run])
         for element, children in zip(in_run, of_run, strict=True):
             copies = (IDENTITY,) if len(children) == 1 else scheme.domain.children

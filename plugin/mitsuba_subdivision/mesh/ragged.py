@@ -16,6 +16,7 @@ An example are the faces of a polygon mesh, whose entries are the vertices at th
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -61,6 +62,13 @@ def chunks_of(count: int, parts: int = 1) -> Iterator[slice]:
     length = CHUNK_LENGTH // parts
     for begin in range(0, count, length):
         yield slice(begin, min(begin + length, count))
+
+
+def runs_of(lengths: ArrayLike, total: int) -> list[slice]:
+    """Return slices of successive rows, of about ``total`` entries each, to bound temporary memory."""
+    number = np.cumsum(lengths, dtype=np.int64) // total
+    bounds = [0, *(np.flatnonzero(np.diff(number)) + 1).tolist(), len(number)]
+    return [slice(begin, end) for begin, end in pairwise(bounds) if begin < end]
 
 
 def sorted_order(keys: IntArray) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:

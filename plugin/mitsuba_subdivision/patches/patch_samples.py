@@ -14,6 +14,7 @@ from ..evaluation.element import SurfaceSamples, evaluate_samples
 from ..evaluation.equations import Evaluator
 from ..evaluation.located_samples import LocatedSamples
 from ..evaluation.patch_tree import patch_tree
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..messages import counted
 from ..schemes.domain import FloatArray
@@ -40,8 +41,7 @@ def located_runs(
     """
     scheme, classes = patches.scheme, patches.classes
     order = np.argsort(class_index.astype(np.min_scalar_type(len(classes))), kind="stable")
-    ends = np.cumsum(patches.control_counts[class_index[order]]) // WEIGHTS
-    runs = np.split(order, np.flatnonzero(np.diff(ends)) + 1) if len(order) else []
+    runs = [order[part] for part in ragged.runs_of(patches.control_counts[class_index[order]], WEIGHTS)]
     for run in counted(runs, "Located samples"):
         used, element = np.unique(class_index[run], return_inverse=True)
         run_classes = [classes[index] for index in used.tolist()]
