@@ -5,6 +5,7 @@ import pytest
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.evaluation.irregular_patch import PIECE_LEVELS
+from mitsuba_subdivision.evaluation.patch_tree import patch_trees
 from mitsuba_subdivision.patches import PieceTable
 from mitsuba_subdivision.patches import piece_table as layout
 from patches.closed_cages import bumpy, mixed_torus
@@ -66,7 +67,8 @@ def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkey
 def test_parts_that_are_divided_alike_share_their_pieces():
     """A semi-sharp crease has thousands of pieces, of few kinds."""
     surface = LimitSurface(tagged(cube(), creases=[(4, 5, 8.0), (5, 7, 8.0), (7, 6, 8.0), (6, 4, 8.0)]))
-    trees = (layout.tree_arrays(surface.scheme, patch_class.signature) for patch_class in surface.patches.classes)
+    elements = patch_trees(surface.scheme, [patch_class.signature for patch_class in surface.patches.classes])
+    trees = (layout.tree_arrays(element) for element in elements)
     pieces = [pieces_of.pieces for tree in trees for pieces_of in tree.maps]
     assert sum(map(len, pieces)) > 3000
     assert sum(len(shared) for shared in {id(shared): shared for shared in pieces}.values()) < 1000

@@ -16,7 +16,7 @@ import numpy as np
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray
 from ..mesh.one_ring import joined_rings, one_ring
-from ..mesh.signature import Signature, signature_at
+from ..mesh.signature import Signature, signatures_at
 from ..schemes.domain import FloatArray, ParameterMap
 from ..schemes.scheme import Scheme, SchemeError
 
@@ -40,18 +40,19 @@ def refined_children(scheme: Scheme, signatures: Sequence[Signature]) -> list[li
     topology, first_half_edges, first_vertices = joined_rings(signatures)
     refined, table = scheme.refine(topology)
     parts = [
-        (parent, domain, half_edge, signature_at(refined, half_edge, scheme.element))
+        (parent, domain, half_edge)
         for parent, first in enumerate(first_half_edges.tolist())
         for domain, half_edge in scheme.children(topology, refined, first)
     ]
+    half_edges = np.array([half_edge for *_, half_edge in parts])
+    of_parts = signatures_at(refined, half_edges, scheme.element)
     # Control points of children of equal connectivity are gathered at once.
     alike: dict[Signature, list[int]] = {}
-    for index, (*_, signature) in enumerate(parts):
+    for index, signature in enumerate(of_parts):
         alike.setdefault(signature.smoothed, []).append(index)
     controls: dict[int, IndexArray] = {}
     for signature, indices in alike.items():
-        half_edges = np.array([parts[index][2] for index in indices])
-        controls |= zip(indices, one_ring(signature).gather(refined, half_edges), strict=True)
+        controls |= zip(indices, one_ring(signature).gather(refined, half_edges[indices]), strict=True)
 
     # A row for each control point of each child, as long as the one-ring of the parent has vertices.
     of_children = [controls[index] for index in range(len(parts))]
@@ -72,6 +73,6 @@ def refined_children(scheme: Scheme, signatures: Sequence[Signature]) -> list[li
     flat: FloatArray = np.bincount(places, weights, minlength=offsets[-1]).astype(np.float64, copy=False)
     blocks = np.split(flat, offsets[np.cumsum(row_counts)[:-1]])
     children: list[list[Child]] = [[] for _ in signatures]
-    for (parent, domain, _, signature), count, block in zip(parts, row_counts, blocks, strict=True):
+    for (parent, domain, _), signature, count, block in zip(parts, of_parts, row_counts, blocks, strict=True):
         children[parent].append(Child(domain, signature, block.reshape(count, -1)))
     return children

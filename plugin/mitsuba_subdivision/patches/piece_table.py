@@ -28,7 +28,6 @@ from ..evaluation.polynomials import polynomial_basis
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared
-from ..mesh.signature import Signature
 from ..messages import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
@@ -150,8 +149,7 @@ class PieceTable:
         bytes_of_level = 4 * PACKET * packets_of_piece * LEVEL_PIECES * tip_count
         if bytes_of_level:
             piece_levels = min(piece_levels, COEFFICIENT_BYTES // bytes_of_level)
-        signatures = counted([kind.signature for kind in table.classes], "Pieces of patch classes")
-        trees = tuple(tree_arrays(table.scheme, signature, piece_levels) for signature in signatures)
+        trees = tuple(tree_arrays(element, piece_levels) for element in counted(elements, "Pieces of patch classes"))
         sizes = np.array([tree.piece_count for tree in trees])
         rings = np.where([len(tree.weights) > 0 for tree in trees], control_counts, 0)
         first_pieces, piece_count = ragged.starts(sizes * counts), int(sizes @ counts)
@@ -226,12 +224,11 @@ def piece_packets(monomial_count: int) -> int:
 # A tree takes up to some megabytes at high valences.
 @lru_cache(maxsize=128)
 def tree_arrays(
-    scheme: Scheme,
-    signature: Signature,
+    element: PatchTree,
     piece_levels: int = PIECE_LEVELS,  # Number of levels of a tip that are pieces; the others are blocks
 ) -> TreeArrays:
-    """Return the arrays of the patch tree of a signature."""
-    (element,) = patch_trees(scheme, [signature])
+    """Return the arrays of a patch tree."""
+    scheme = element.scheme
     kinds, turns, first = element.nodes.T.copy()
     # Regular pieces come before those of tips.
     maps, piece_count = [], 0
