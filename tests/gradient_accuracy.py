@@ -25,10 +25,11 @@ import mitsuba_subdivision
 import mitsuba as mi
 import numpy as np
 from gradients import outlines, solids
-from gradients.estimates import Estimate, Pictures, along, gradients
-from gradients.scenes import POINTS, inside, outline, textured_cube, tilt
+from gradients.estimates import Estimate, Pictures
+from gradients.scenes import POINTS, inside, textured_cube, tilt
 from gradients.surfaces import CLOSED, motions
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
+from shapes.cages import described
 
 VARIANT = "llvm_ad_rgb"
 MATERIALS, RATES = ("diffuse", "rough", "textured"), (2, 4, 8, 16)
@@ -56,12 +57,11 @@ def off(estimate: Estimate, expected: float, random: float) -> str:
 def print_inside(spp: int, seeds: int) -> None:
     print("material   shading  rate      gradient            difference            off")
     cage = textured_cube()
-    ways = {POINTS: cage.positions}, {POINTS: tilt(cage.positions)}
     for material in MATERIALS:
         for shading, rate in [*(("vertex", rate) for rate in RATES), ("exact", RATES[0])]:
-            shape = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": rate, "shading": shading}
-            pictures = Pictures(inside(material, "around", shape), *ways, spp, seeds)
-            estimate, difference = pictures.derivatives("reverse"), pictures.differences(STEP)
+            scene = inside(material, "around", described(cage, tessellation_rate=rate, shading=shading))
+            pictures = Pictures(scene, {POINTS: tilt(cage.positions)}, spp, seeds)
+            estimate, difference = pictures.reverse(), pictures.differences(STEP)
             apart = off(estimate, difference.mean, (estimate - difference).error)
             print(f"{material:<10} {shading:<8} {rate:4}  {estimate}  {difference}  {apart}", flush=True)
 
@@ -76,10 +76,10 @@ def print_outlines(spp: int, seeds: int) -> None:
             expected = outlines.change(surface, positions, rate)
             estimates = []
             for emits, more in ((False, {}), (True, {"face_normals": True}), (True, {})):
-                scene = outline(outlines.properties(surface, rate, **more), emits=emits)
-                estimate = along(gradients(scene, POINTS, spp, seeds), positions)
+                scene, along = outlines.outline_of(surface, rate, emits=emits, **more), {POINTS: positions}
+                estimate = Pictures(scene, along, spp, seeds).reverse()
                 estimates.append(estimate if emits else Estimate(-estimate.values))
-            pictures = Pictures(scene, {POINTS: positions}, {POINTS: positions}, 4 * spp, seeds)
+            pictures = Pictures(scene, along, 4 * spp, seeds)
             texts = "   ".join(off(estimate, expected, estimate.error) for estimate in estimates)
             print(f"{name:<24} {rate:3}  {expected:.5f}  {texts}   {pictures.differences(GROWTH)}", flush=True)
 
@@ -90,9 +90,7 @@ def print_triangles(_spp: int, _seeds: int) -> None:
     for name, build in CLOSED.items():
         surface = build()
         directions = list(motions(surface).values())
-        area = surface.stiffness(solids.STIFFNESS_ORDER) @ surface.cage.positions
-        areas = [(area * direction).sum() for direction in directions]
-        exact = np.column_stack([areas, solids.derivatives_of_surface(surface, directions)])
+        exact = solids.exact_derivatives(surface, directions)
         for rate in INTEGRAL_RATES:
             _, of_triangles = solids.derivatives_of(surface, directions, rate, types)
             parts = zip(*(np.split(values, [1, 2, 5], axis=1) for values in (of_triangles - exact, exact)), strict=True)

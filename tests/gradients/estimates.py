@@ -37,12 +37,12 @@ class Estimate:
 
 
 class Pictures:
-    """Renders of a scene whose parameters move: ``start`` has their values, ``along`` how they change with the step."""
+    """Renders of a scene of which parameters move from where they are, along flat arrays by their keys."""
 
-    def __init__(self, scene, start, along, spp, seeds=6):
-        self.scene, self.parameters = scene, mi.traverse(scene)
-        self.start, self.along = ({k: upload(mi.Float, v) for k, v in named.items()} for named in (start, along))
-        self.spp, self.seeds = spp, range(seeds)
+    def __init__(self, scene, along, spp, seeds=6):
+        self.scene, self.parameters, self.spp, self.seeds = scene, mi.traverse(scene), spp, range(seeds)
+        self.along = {key: upload(mi.Float, np.ravel(values)) for key, values in along.items()}
+        self.start = {key: dr.opaque(self.parameters[key]) for key in along}
 
     def mean(self, step, seed):
         for key, value in self.start.items():
@@ -55,44 +55,30 @@ class Pictures:
         ends = [[self.mean(mi.Float(side * h), seed).array[0] for side in (1, -1)] for seed in self.seeds]
         return Estimate(np.array([(a - b) / (2 * h) for a, b in ends]))
 
-    def derivatives(self, mode):
+    def forward(self):
         values = []
         for seed in self.seeds:
             step = mi.Float(0)
             dr.enable_grad(step)
             value = self.mean(step, seed)
-            if mode == "forward":
-                dr.forward(step)
-                values.append(dr.grad(value).array[0])
-            else:
-                dr.backward(value)
-                values.append(dr.grad(step)[0])
+            dr.forward(step)
+            values.append(dr.grad(value).array[0])
         return Estimate(np.array(values, dtype=np.float64))
 
+    def gradients(self):
+        """``(seeds, n)`` gradients of the mean by each of the parameters, by key."""
+        by_seed = []
+        for seed in self.seeds:
+            dr.enable_grad(self.start)
+            dr.backward(self.mean(mi.Float(0), seed))
+            by_seed.append({key: np.array(dr.grad(value), dtype=np.float64) for key, value in self.start.items()})
+            dr.disable_grad(self.start)
+        return {key: np.array([values[key] for values in by_seed]) for key in self.start}
 
-def gradients(scene, key, spp, seeds=6, kept=()):
-    """``(seeds, n, 3)`` gradients of the mean by flat points, one for each seed.
-
-    Parameters that are ``kept`` are assigned as well: Mitsuba's own meshes make new normals when only positions are.
-    """
-    parameters = mi.traverse(scene)
-    start, by_seed = mi.Float(parameters[key]), []
-    # Copies: what is the same array is no assignment.
-    others = {name: dr.opaque(parameters[name]) for name in kept}
-    for seed in range(seeds):
-        points = mi.Float(start)
-        dr.enable_grad(points)
-        parameters[key] = points
-        for name, values in others.items():
-            parameters[name] = dr.opaque(values)
-        parameters.update()
-        dr.backward(dr.mean(mi.render(scene, parameters, spp=spp, seed=seed), axis=None))
-        by_seed.append(np.array(dr.grad(points), dtype=np.float64).reshape(-1, 3))
-    parameters[key] = start
-    parameters.update()
-    return np.array(by_seed)
+    def reverse(self):
+        return sum_along(self.gradients(), self.along)
 
 
-def along(by_seed, direction):
-    """Estimate of the derivative along a direction."""
-    return Estimate((by_seed * direction).sum(axis=(1, 2)))
+def sum_along(gradients, along):
+    """Estimate of the derivative along directions, by key."""
+    return Estimate(sum(gradients[key] @ np.ravel(along[key]).astype(np.float64) for key in along))

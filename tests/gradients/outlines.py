@@ -1,12 +1,14 @@
-"""What triangles cover of a picture: areas of outlines by scan lines, without any renderer."""
+"""Pictures of outlines, and what triangles cover of them: areas by scan lines, without any renderer."""
 
-import mitsuba as mi
 import numpy as np
-from gradients.scenes import EYE, FOV, TARGET, UP
 from gradients.surfaces import ALL
 from kernels.surfaces import CAGES
 from mitsuba_subdivision import ControlCage, LimitSurface
+from shapes.cages import described
+from shapes.scenes import perspective, scene_with
 
+EYE, TARGET, UP, FOV = (1, -5, 2), (0, 0, 0), (0, 0, 1), 40
+BLACK = {"type": "diffuse", "reflectance": 0.0}
 LINES = 8192
 # Segments per edge, and the step of differences of areas.
 RATE, STEP = 2, 1e-3
@@ -19,9 +21,22 @@ SURFACES = {
 }
 
 
-def properties(surface, rate=RATE, **more):
-    cage, scheme = surface.cage.as_properties(mi), surface.scheme.name
-    return {"type": "subdivision", **cage, "scheme": scheme, "tessellation_rate": rate, **more}
+def outline(shape, *, emits=False, resolution=32):
+    """A black shape before a white sky, or one that emits before nothing: the picture's mean is the outline's area.
+
+    The interior term is left out. It is zero, and so are shadows.
+    """
+    seen = {"integrator": {"type": "direct_projective", "sppi": 0, "sppc": 0}}
+    seen["sensor"] = perspective(resolution, EYE, TARGET, UP, fov=FOV)
+    light = {"emitter": {"type": "area", "radiance": 1.0}} if emits else {}
+    return scene_with(
+        **seen, **({} if emits else {"sky": {"type": "constant"}}), shape={**shape, "bsdf": BLACK, **light}
+    )
+
+
+def outline_of(surface, rate=RATE, *, emits=False, **more):
+    shape = described(surface.cage, scheme=surface.scheme.name, tessellation_rate=rate, **more)
+    return outline(shape, emits=emits)
 
 
 def change(surface, direction, rate=RATE):
@@ -30,21 +45,26 @@ def change(surface, direction, rate=RATE):
     def area(step):
         moved = surface.cage.with_positions(surface.cage.positions + step * direction)
         made = LimitSurface(moved, surface.scheme).tessellate(rate)
-        return covered(made.positions, made.triangles, EYE, TARGET, UP, FOV)
+        return covered(made.positions, made.triangles)
 
     return (area(STEP) - area(-STEP)) / (2 * STEP)
 
 
-def covered(positions, triangles, eye, target, up, fov, lines=LINES):
+def covered(positions, triangles, eye=EYE, target=TARGET, up=UP, fov=FOV):
     """Share of a square picture that is covered by triangles, all of them before the eye and inside the picture.
 
     Along each of many lines, triangles cover intervals with known ends. Their union is exact; the sum over lines is
     the midpoint rule, of second order as the widths of an outline of straight edges are continuous.
     """
-    triangles = _projected(positions, eye, target, up, fov)[triangles]
+    forward = np.subtract(target, eye)
+    right = np.cross(forward, up)
+    axes = [axis / np.linalg.norm(axis) for axis in (right, np.cross(right, forward), forward)]
+    seen = (positions - eye) @ np.array(axes).T
+    # Places in the picture, which reaches from -1 to 1.
+    triangles = (seen[:, :2] / (seen[:, 2:] * np.tan(np.radians(fov) / 2)))[triangles]
     upwards = np.argsort(triangles[..., 1], axis=1)
     low, middle, high = np.take_along_axis(triangles, upwards[..., None], 1).swapaxes(0, 1)
-    step = 2 / lines
+    step = 2 / LINES
     first, end = (np.ceil((corner[:, 1] + 1) / step - 0.5).astype(int) for corner in (low, high))
     counts = end - first
     which = np.repeat(np.arange(len(triangles)), counts)
@@ -63,12 +83,3 @@ def covered(positions, triangles, eye, target, up, fov, lines=LINES):
     begin, reached = begin[order], np.maximum.accumulate(end[order])
     before = np.concatenate([[-np.inf], reached[:-1]])
     return np.maximum(reached - np.maximum(begin, before), 0).sum() * step / 4
-
-
-def _projected(positions, eye, target, up, fov):
-    """``(n, 2)`` places in the picture, which reaches from -1 to 1."""
-    forward = np.subtract(target, eye)
-    right = np.cross(forward, up)
-    axes = [axis / np.linalg.norm(axis) for axis in (right, np.cross(right, forward), forward)]
-    seen = (positions - eye) @ np.array(axes).T
-    return seen[:, :2] / (seen[:, 2:] * np.tan(np.radians(fov) / 2))

@@ -1,9 +1,8 @@
-"""Scenes whose pictures are differentiated: inside an outline under a smooth sky, and outlines before a white one."""
+"""A textured cube under a smooth sky, of which the picture shows what lies inside its outline."""
 
 import mitsuba as mi
 import numpy as np
-from mitsuba_subdivision import ControlCage
-from mitsuba_subdivision.cage import named_cages
+from shapes.cages import cube
 from shapes.scenes import perspective, scene_with
 
 POINTS = "shape.control_points"
@@ -11,14 +10,10 @@ POINTS = "shape.control_points"
 RESOLUTION = 16
 
 
-# Inside
-
-
 def textured_cube():
     """A cube with texture coordinates without seams; all that the view shows has different ones."""
-    cube = named_cages.cube()
-    texcoords = cube.positions[:, :2] * 0.4 + 0.1 * cube.positions[:, 2:] + 0.5
-    return ControlCage(cube.positions, cube.face_vertices.reshape(-1, 4), texcoords=texcoords)
+    positions = cube().positions
+    return cube(texcoords=positions[:, :2] * 0.4 + 0.1 * positions[:, 2:] + 0.5)
 
 
 def sky(kind):
@@ -53,7 +48,7 @@ def inside(material, light, shape):
     """A view of the middle of a shape."""
     # Of directions that the diffuse material chooses, the variance is far larger: they turn with the tangents.
     samples = {} if material == "rough" else {"bsdf_samples": 0}
-    sensor = perspective(RESOLUTION, [1, -4, 2], TARGET, UP, fov=14)
+    sensor = perspective(RESOLUTION, [1, -4, 2], fov=14)
     shape = {**shape, "bsdf": materials()[material]}
     return scene_with(i={"type": "direct", **samples}, sensor=sensor, sky=sky(light), shape=shape)
 
@@ -62,23 +57,3 @@ def tilt(positions):
     """Shear and bending, which turn what the view shows upwards and aside."""
     x, _, z = positions.T
     return np.stack([np.zeros(len(positions)), z + 0.3 * x, 0.2 * z**2], axis=1)
-
-
-# Outlines
-
-EYE, TARGET, UP, FOV = (1, -5, 2), (0, 0, 0), (0, 0, 1), 40
-BLACK = {"type": "diffuse", "reflectance": 0.0}
-LIGHT = {"type": "area", "radiance": 1.0}
-
-
-def outline(shape, *, emits=False, resolution=32):
-    """A black shape before a white sky, or one that emits before nothing: the picture's mean is the outline's area.
-
-    The interior term is left out. It is zero, and so are shadows.
-    """
-    integrator = {"type": "direct_projective", "sppi": 0, "sppc": 0}
-    sensor = perspective(resolution, EYE, TARGET, UP, fov=FOV)
-    shape, sky = {**shape, "bsdf": BLACK}, {"sky": {"type": "constant"}}
-    if emits:
-        shape, sky = {**shape, "emitter": LIGHT}, {}
-    return scene_with(integrator=integrator, sensor=sensor, shape=shape, **sky)

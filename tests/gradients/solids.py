@@ -1,9 +1,8 @@
 """Area, volume and moments: of triangles with derivatives by Dr.Jit, and of closed limit surfaces by quadrature.
 
-Moments are those of the solid that a closed surface bounds: ``first`` the integrals of x, y and z over it, ``second``
-those of their products. Derivatives of exact ones follow from Hadamard's formula: a surface that moves by a field
-changes the integral of a function over its solid by the integral of the function times the field's part along the
-normal.
+Moments are integrals of x, y and z, then of their products, over the solid that a closed surface bounds. Derivatives of
+exact ones follow from Hadamard's formula: a surface that moves by a field changes the integral of a function over its
+solid by the integral of the function times the field's part along the normal.
 """
 
 import drjit as dr
@@ -28,12 +27,7 @@ def of_triangles(types, positions, triangles):
     total = a + b + c
     first = [dr.sum(volume * total[k]) / 4 for k in range(3)]
     second = [dr.sum(volume * (total[i] * total[j] + a[i] * a[j] + b[i] * b[j] + c[i] * c[j])) / 20 for i, j in PAIRS]
-    return {"area": [area], "volume": [dr.sum(volume)], "first": first, "second": second}
-
-
-def joined(integrals):
-    """All integrals one after the other."""
-    return np.concatenate([np.ravel([np.array(value) for value in integrals[name]]) for name in integrals])
+    return [area, dr.sum(volume), *first, *second]
 
 
 def derivatives_of(surface, directions, rate, types):
@@ -47,29 +41,35 @@ def derivatives_of(surface, directions, rate, types):
         dr.set_grad(points, types.floats(direction.ravel()))
         integrals = of_triangles(types, kernel(points)[0], table.triangles)
         dr.forward_to(integrals)
-        derivatives.append(joined(dr.grad(integrals)))
-    return joined(dr.detach(integrals)), np.array(derivatives)
+        derivatives.append(np.ravel([np.array(gradient) for gradient in dr.grad(integrals)]))
+    return np.ravel([np.array(dr.detach(value)) for value in integrals]), np.array(derivatives)
 
 
 def of_surface(surface):
-    """Volume and moments of what a limit surface bounds."""
+    """``(10,)`` volume and moments of what a limit surface bounds."""
     # With the points themselves for a field, Gauss's theorem gives 3, 4 and 5 times the integrals.
-    (total,) = derivatives_of_surface(surface, [surface.cage.positions]) / np.repeat([3, 4, 5], [1, 3, 6])
-    return {"volume": total[:1], "first": total[1:4], "second": total[4:]}
+    return derivatives_of_surface(surface, [surface.cage.positions])[0] / np.repeat([3, 4, 5], [1, 3, 6])
 
 
 def derivatives_of_surface(surface, directions):
     """``(n, 10)`` derivatives of volume and moments by moving the control points along each of ``n`` directions."""
-    each_field = [field[surface.cage.cut_mesh.vertex] for field in (surface.cage.positions, *directions)]
-    points, *moves = (SurfacePieces.build(surface.patches, field) for field in each_field)
-    total = _integrated(points.regular, [field_pieces.regular for field_pieces in moves])
-    for tips, *moved in zip(points.tips, *(field_pieces.tips for field_pieces in moves), strict=True):
+    fields = [field[surface.cage.cut_mesh.vertex] for field in (surface.cage.positions, *directions)]
+    points, *moves = (SurfacePieces.build(surface.patches, field) for field in fields)
+    total = _integrated(points.regular, [pieces.regular for pieces in moves])
+    for tips, *moved in zip(points.tips, *(pieces.tips for pieces in moves), strict=True):
         for level in range(MOST_LEVELS):
-            of_level = _integrated(tips.level(level), [field_pieces.level(level) for field_pieces in moved])
+            of_level = _integrated(tips.level(level), [pieces.level(level) for pieces in moved])
             total += of_level
             if (np.abs(of_level).max(axis=1) <= LEFT_OUT * np.abs(total).max(axis=1)).all():
                 break
     return total
+
+
+def exact_derivatives(surface, directions):
+    """``(n, 11)`` derivatives of the limit surface's area, volume and moments."""
+    area = surface.stiffness(STIFFNESS_ORDER) @ surface.cage.positions
+    areas = [(area * direction).sum() for direction in directions]
+    return np.column_stack([areas, derivatives_of_surface(surface, directions)])
 
 
 def _integrated(pieces, moves):

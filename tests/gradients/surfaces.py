@@ -5,40 +5,32 @@ import pytest
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from patches.closed_cages import bumpy, cage_of, cube_with_hexagon
-from reference.refined_cages import refine_first, tagged
-from shapes.cages import RING
+from reference.refined_cages import refine_first
+from shapes.cages import RING, cube
 
 
 def ring_of(sharpness):
     """A cube with a ring of creases around a face."""
-    return tagged(named_cages.cube(), creases=[(a, b, sharpness) for a, b, _ in RING])
+    return LimitSurface(bumpy(cube(creases=[(a, b, sharpness) for a, b, _ in RING])))
+
+
+def refined_first():
+    with pytest.MonkeyPatch.context() as patched:
+        refine_first(patched)
+        surface = LimitSurface(bumpy(cube_with_hexagon()))
+        assert surface.patches.refined is not None
+    return surface
 
 
 CLOSED = {
     "catmull_clark": lambda: LimitSurface(bumpy(cage_of("catmull_clark", "prism"))),
     "loop": lambda: LimitSurface(bumpy(cage_of("loop", "bipyramid")), "loop"),
     "doo_sabin": lambda: LimitSurface(bumpy(cage_of("doo_sabin", "prism")), "doo_sabin"),
-    "creased": lambda: LimitSurface(bumpy(ring_of(10.0))),
-    "semi-sharp": lambda: LimitSurface(bumpy(ring_of(2.5))),
-    "refined first": lambda: _refined_first(bumpy(cube_with_hexagon())),
+    "creased": lambda: ring_of(10.0),
+    "semi-sharp": lambda: ring_of(2.5),
+    "refined first": refined_first,
 }
 ALL = {**CLOSED, "open": lambda: LimitSurface(bumpy(named_cages.extraordinary(5, closed=False), size=0.02))}
-
-
-def _refined_first(cage):
-    with pytest.MonkeyPatch.context() as patched:
-        refine_first(patched)
-        surface = LimitSurface(cage)
-        assert surface.patches.refined is not None
-    return surface
-
-
-def moved(surface, positions):
-    """The surface of moved control points; where it was refined first, it is so again."""
-    cage = surface.cage.with_positions(positions)
-    if surface.patches.refined is not None:
-        return _refined_first(cage)
-    return LimitSurface(cage, surface.scheme)
 
 
 def motions(surface):
