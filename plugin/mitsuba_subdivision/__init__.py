@@ -28,7 +28,10 @@ if TYPE_CHECKING:
     from .device_arrays import upload
     from .evaluation.element import limit_stencil
     from .evaluation.scheme_laws import check_scheme
-    from .patches import AreaSamples, ClosestPoints, ElementBounds, StencilMatrices
+    from .patches.area_samples import AreaSamples
+    from .patches.closest_points import ClosestPoints
+    from .patches.patch_samples import StencilMatrices
+    from .patches.polynomial_pieces import ElementBounds
     from .refinement.cage_refinement import CageRefinement
     from .schemes import SchemeError
     from .shapes.derivatives import loss_of_views
@@ -72,7 +75,10 @@ _NAMES = {
     "device_arrays": ("upload",),
     "evaluation.element": ("limit_stencil",),
     "evaluation.scheme_laws": ("check_scheme",),
-    "patches": ("AreaSamples", "ClosestPoints", "ElementBounds", "StencilMatrices"),
+    "patches.area_samples": ("AreaSamples",),
+    "patches.closest_points": ("ClosestPoints",),
+    "patches.patch_samples": ("StencilMatrices",),
+    "patches.polynomial_pieces": ("ElementBounds",),
     "refinement.cage_refinement": ("CageRefinement",),
     "schemes": ("SchemeError", "register_scheme"),
     "shapes.derivatives": ("loss_of_views",),

@@ -11,7 +11,7 @@ from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.evaluation.patch_tree import isolated_signature, patch_tree, patch_trees
 from mitsuba_subdivision.evaluation.refined_rings import refined_children
 from mitsuba_subdivision.mesh.signature import Fan, Signature
-from mitsuba_subdivision.patches import PatchTable
+from mitsuba_subdivision.patches.patch_table import PatchTable
 from mitsuba_subdivision.schemes import CatmullClark, SchemeError
 from mitsuba_subdivision.schemes.domain import ParameterMap
 from reference.refined_cages import tagged

@@ -8,7 +8,7 @@ solid by the integral of the function times the field's part along the normal.
 import drjit as dr
 import numpy as np
 from mitsuba_subdivision.kernels.vertex_kernel import VertexKernel
-from mitsuba_subdivision.patches import SurfacePieces
+from mitsuba_subdivision.patches.polynomial_pieces import SurfacePieces
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
 # Exact for products of five polynomials of degree 3 in each parameter, two of them derivatives, or of degree 4.

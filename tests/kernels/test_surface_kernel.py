@@ -28,7 +28,7 @@ from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
 from mitsuba_subdivision.evaluation.irregular_patch import PIECE_LEVELS
 from mitsuba_subdivision.kernels.algebra import AffineMap
 from mitsuba_subdivision.kernels.surface_kernel import SurfaceKernel
-from mitsuba_subdivision.patches import PieceTable
+from mitsuba_subdivision.patches.piece_table import PieceTable
 from mitsuba_subdivision.schemes import CatmullClark
 from patches.closed_cages import bumpy, tetrahedron, torus
 from reference.refined_cages import half_disc, refine_first

@@ -9,7 +9,7 @@ import pytest
 from kernels.surfaces import surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.patches import uniform_locations
+from mitsuba_subdivision.patches.area_samples import uniform_locations
 from reference.refined_cages import sheet, tagged
 from scipy.special import chdtrc, kolmogorov
 

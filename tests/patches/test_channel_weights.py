@@ -6,7 +6,8 @@ from kernels.surfaces import grid_locations
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.contents import Attribute
-from mitsuba_subdivision.patches import Channel, channel
+from mitsuba_subdivision.patches import channel
+from mitsuba_subdivision.patches.channel import Channel
 from patches.closed_cages import mixed_torus, tetrahedron, torus
 from reference.refined_cages import refine_first, tagged
 

@@ -4,7 +4,7 @@ from evaluation.test_semi_sharp import CAGES as SEMI_SHARP
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import FEW_CODES, NEAR_FACES, row_codes, signature_at
-from mitsuba_subdivision.patches import PatchTable
+from mitsuba_subdivision.patches.patch_table import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
 from patches.closed_cages import CLOSED_CAGES, SURFACES, cage_of, polygons, torus, triangulated
 from reference.exact_samples import mesh_of

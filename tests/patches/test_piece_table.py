@@ -6,8 +6,8 @@ from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.evaluation.irregular_patch import PIECE_LEVELS
 from mitsuba_subdivision.evaluation.patch_tree import patch_trees
-from mitsuba_subdivision.patches import PieceTable
 from mitsuba_subdivision.patches import piece_table as layout
+from mitsuba_subdivision.patches.piece_table import PieceTable
 from patches.closed_cages import bumpy, mixed_torus
 from reference.refined_cages import refine_first, sheet, tagged
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision.mesh.connectivity import Topology
-from mitsuba_subdivision.patches import PatchTable
+from mitsuba_subdivision.patches.patch_table import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
 from mitsuba_subdivision.schemes.domain import SQUARE, TRIANGLE
 from mitsuba_subdivision.tessellation.uniform_grid import UniformGrid

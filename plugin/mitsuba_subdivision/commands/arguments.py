@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from typing import Any, NoReturn, TypeVar
 
-from ..schemes import SCHEME_CLASSES
+from ..schemes import BUILT_IN
 from ..tessellation import HIGHEST_RATE
 
 # Exit status of wrong usage, as argparse has it.
@@ -26,7 +26,7 @@ def add_variant(parser: argparse.ArgumentParser, *aliases: str) -> None:
 def add_cage_options(parser: argparse._ActionsContainer, default_rate: str) -> None:
     """Add the options that choose one surface of a file: ``--scheme``, ``--prim``, ``--time``, ``--rate``."""
     add = parser.add_argument
-    add("--scheme", help=f"one of {', '.join(SCHEME_CLASSES)} (default: the file's, otherwise catmull_clark)")
+    add("--scheme", help=f"one of {', '.join(BUILT_IN)} (default: the file's, otherwise catmull_clark)")
     add("--prim", metavar="PATH", help="mesh of a USD file that has several: its path, or * for all meshes as one cage")
     add("--time", type=float, help="time code of a USD file (default: the first)")
     add("--rate", type=rate, metavar="N", help=f"segments per edge of the cage (default: {default_rate})")

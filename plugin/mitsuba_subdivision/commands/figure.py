@@ -8,7 +8,7 @@ from pathlib import Path
 from ..figures import FIGURES, FigureOptions, require_options
 from ..figures.output import COLUMN, INCH, PAGE
 from ..messages import print_result
-from ..schemes import SCHEME_CLASSES
+from ..schemes import BUILT_IN
 from ..variants import set_variant
 from ..whole_file import require_folder, require_writable
 from .arguments import CommandParser, add_variant, checked, positive, table
@@ -32,8 +32,8 @@ def figure(parser: CommandParser) -> None:
     add("--spp", type=positive, metavar="N", help="samples per pixel (default: 256)")
     text = f"width on paper, as 84mm or 7in (default: {PAGE:g}mm, or {COLUMN:g}mm for figures of a column)"
     add("--width", type=_width, metavar="LENGTH", help=text)
-    text = f"one of {', '.join(SCHEME_CLASSES)} (default: catmull_clark)"
-    add("--scheme", choices=list(SCHEME_CLASSES), metavar="SCHEME", help=text)
+    text = f"one of {', '.join(BUILT_IN)} (default: catmull_clark)"
+    add("--scheme", choices=BUILT_IN, metavar="SCHEME", help=text)
     takers = ", ".join(name for name, figure in FIGURES.items() if "cage" in figure.options)
     add("--cage", type=Path, metavar="FILE", help=f"a Catmull-Clark cage of your own, for {takers}")
     text = "png, pdf or exr; can be repeated (default: all that the figure has)"

@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 
 from ..cage import ControlCage
 from ..mesh.connectivity import IntArray
-from ..patches import AreaSamples, ClosestPoints
+from ..patches.area_samples import AreaSamples
+from ..patches.closest_points import ClosestPoints
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from .fitting import Fit, Schedulable, Schedule, State

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import drjit as dr
 
 from ..mesh.shared import shared
-from ..patches import PieceTable
+from ..patches.piece_table import PieceTable
 from .algebra import Monomials
 from .array_types import ArrayTypes, Float, Index, Mask, Value
 from .linear_maps import CoefficientMap, ControlValues, SparseMatrix
 from .piece_kernel import PatchValues, PieceKernel
 
 if TYPE_CHECKING:
-    from ..patches import Channel
+    from ..patches.channel import Channel
     from .locations import Location
 
 # Exponents of the monomials 1, u, v and, on the square, u v.

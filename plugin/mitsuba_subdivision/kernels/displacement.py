@@ -24,7 +24,7 @@ from .array_types import Float, Index, Mask, Value
 from .piece_kernel import PatchValues, Piece, differences
 
 if TYPE_CHECKING:
-    from ..patches import Channel
+    from ..patches.channel import Channel
     from .channel_kernel import ChannelKernel
 
 # Minimum cosine of the angle between the normal and the cross product of the derivatives at which these span the

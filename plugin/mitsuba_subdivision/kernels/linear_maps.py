@@ -36,7 +36,7 @@ from .array_types import (
 if TYPE_CHECKING:
     from scipy import sparse
 
-    from ..patches import PieceTable
+    from ..patches.piece_table import PieceTable
 
 _MATRICES: Shared[SparseMatrix] = Shared()
 _MADE: Shared[LaterArrays] = Shared()

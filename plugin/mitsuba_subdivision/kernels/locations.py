@@ -15,7 +15,7 @@ from ..tessellation.uniform_grid import UniformGrid
 from .array_types import ArrayTypes, Float, Index, Index4, Mask
 
 if TYPE_CHECKING:
-    from ..patches import PieceTable
+    from ..patches.piece_table import PieceTable
     from ..tessellation.adaptive_grid import AdaptiveGrid
     from ..tessellation.vertex_table import VertexTable
 

@@ -38,7 +38,7 @@ from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Va
 from .locations import ElementWalk, doublings, in_child, turn_matrix, turned
 
 if TYPE_CHECKING:
-    from ..patches import PieceTable
+    from ..patches.piece_table import PieceTable
 
 # Lower bound of the distance from an extraordinary point, in parameters of the tip, for computing its level: zero has
 # no exponent. No level is as deep as this.

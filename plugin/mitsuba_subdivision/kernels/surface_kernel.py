@@ -20,7 +20,8 @@ from .piece_kernel import PatchValues, Piece, PieceKernel, differences
 from .vertex_kernel import coordinates_expected
 
 if TYPE_CHECKING:
-    from ..patches import PieceTable, SamplingCells
+    from ..patches.area_samples import SamplingCells
+    from ..patches.piece_table import PieceTable
     from .displacement import Displacement
     from .nearest_points import NearestPoints
 

@@ -1,12 +1,9 @@
 """Subdivision schemes: refinement rules, regular bases and parameter domains."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from ..deferred import deferred
+from .catmull_clark import CatmullClark
+from .doo_sabin import DooSabin
+from .loop import Loop
 from .scheme import (
-    SCHEME_CLASSES,
     PhantomPoint,
     Refinement,
     Scheme,
@@ -18,12 +15,8 @@ from .scheme import (
     with_rules,
 )
 
-if TYPE_CHECKING:
-    from .catmull_clark import CatmullClark
-    from .doo_sabin import DooSabin
-    from .loop import Loop
-
 __all__ = [
+    "BUILT_IN",
     "CatmullClark",
     "DooSabin",
     "Loop",
@@ -38,4 +31,7 @@ __all__ = [
     "with_rules",
 ]
 
-__getattr__ = deferred(__name__, {module: (kind,) for module, kind in SCHEME_CLASSES.items()})
+# Names of the schemes of this package.
+BUILT_IN = tuple(kind.name for kind in (CatmullClark, DooSabin, Loop))
+for _kind in (CatmullClark, DooSabin, Loop):
+    register_scheme(_kind())

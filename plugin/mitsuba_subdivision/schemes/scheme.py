@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from abc import ABC, abstractmethod
 from copy import copy
 from dataclasses import dataclass
@@ -22,8 +21,6 @@ if TYPE_CHECKING:
     # Importing SciPy's sparse arrays takes 0.1 s and 20 MB, and local meshes do not need them.
     from scipy import sparse
 
-# Module and class of each built-in scheme. A scheme is created at its first use.
-SCHEME_CLASSES = {"catmull_clark": "CatmullClark", "doo_sabin": "DooSabin", "loop": "Loop"}
 _SCHEMES: dict[str, Scheme] = {}
 
 # How Catmull-Clark refines triangles.
@@ -275,11 +272,7 @@ def scheme_named(name: str) -> Scheme:
         If the name is unknown; the message lists the known names.
     """
     if name not in _SCHEMES:
-        if name not in SCHEME_CLASSES:
-            raise SchemeError(
-                f'unknown scheme "{name}"; known schemes: {", ".join(sorted({*SCHEME_CLASSES, *_SCHEMES}))}'
-            )
-        _SCHEMES[name] = getattr(importlib.import_module(f".{name}", __package__), SCHEME_CLASSES[name])()
+        raise SchemeError(f'unknown scheme "{name}"; known schemes: {", ".join(sorted(_SCHEMES))}')
     return _SCHEMES[name]
 
 

@@ -35,7 +35,7 @@ from .parameter_table import errors_about
 
 if TYPE_CHECKING:
     from ..cage import ControlCage
-    from ..patches import Channel, ChannelLayout
+    from ..patches.channel import Channel, ChannelLayout
     from ..surface import LimitSurface
     from ..tessellation.attribute_table import AttributeTable
 

@@ -27,7 +27,8 @@ from ..kernels.locations import Location
 from ..kernels.piece_kernel import PatchValues
 from ..kernels.surface_kernel import SurfaceKernel
 from ..mesh.connectivity import IntArray
-from ..patches import PatchSampler, contracts_alike
+from ..patches.channel import contracts_alike
+from ..patches.patch_samples import PatchSampler
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
 from ..tessellation.criterion import DisplacementBound
@@ -38,7 +39,7 @@ from .device_state import flat_type, is_recording
 if TYPE_CHECKING:
     from scipy import sparse
 
-    from ..patches import Channel
+    from ..patches.channel import Channel
     from ..tessellation.attribute_table import AttributeLayout
     from .exact_shading import ExactShading
     from .parameters import Parameters

@@ -15,7 +15,7 @@ from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 
 if TYPE_CHECKING:
-    from ..patches import PatchTable
+    from ..patches.patch_table import PatchTable
 
 # Distance by which rounding may put a parameter outside its domain.
 DOMAIN_TOLERANCE = 1e-12

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from .. import patches
 from ..cage import ControlCage
 from ..cage.contents import Attribute
 from ..cage.errors import CageError
@@ -19,6 +18,14 @@ from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..evaluation.located_samples import LocatedSamples, limit_stencils
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
+from ..patches.area_samples import AreaSamples, SamplingCells, surface_areas, uniform_locations
+from ..patches.channel import Channel, ChannelLayout
+from ..patches.closest_points import ClosestPoints, ClosestPointSearch
+from ..patches.energies import Density, energy_matrix, gradients, hessians
+from ..patches.patch_samples import PatchSampler, StencilMatrices, stencil_matrices
+from ..patches.patch_table import PatchTable
+from ..patches.piece_table import PieceTable
+from ..patches.polynomial_pieces import ElementBounds, SurfacePieces
 from ..refinement.adapted_scheme import adapted_scheme
 from ..schemes import Scheme
 from ..schemes.domain import FloatArray
@@ -35,20 +42,6 @@ if TYPE_CHECKING:
     from scipy import sparse
 
     from ..kernels.surface_kernel import SurfaceKernel
-    from ..patches import (
-        AreaSamples,
-        Channel,
-        ClosestPoints,
-        ClosestPointSearch,
-        ElementBounds,
-        PatchSampler,
-        PatchTable,
-        PieceTable,
-        SamplingCells,
-        StencilMatrices,
-        SurfacePieces,
-    )
-    from ..patches.energies import Density
     from ..tessellation.criterion import Criterion
 
 # Name of the texture coordinates among the attributes.
@@ -115,9 +108,9 @@ class LimitSurface:
         require_valences(self.cage, self.scheme)
         topology = self.cage.cut_mesh.topology
         if self.scheme.element == "face":
-            return patches.PatchTable(topology, self.scheme, self.cage.is_hole)
+            return PatchTable(topology, self.scheme, self.cage.is_hole)
         # Sharpness at a non-manifold vertex has no meaning where vertices do not stay.
-        return patches.PatchTable(topology.with_rules(None, None), self.scheme)
+        return PatchTable(topology.with_rules(None, None), self.scheme)
 
     def evaluate(
         self,
@@ -167,7 +160,7 @@ class LimitSurface:
 
     @cached_property
     def _sampler(self) -> PatchSampler:
-        return patches.PatchSampler(self.patches, self.cage.positions, self.cage.cut_mesh.vertex)
+        return PatchSampler(self.patches, self.cage.positions, self.cage.cut_mesh.vertex)
 
     def matrix(self, element: ArrayLike, uv: ArrayLike, corner: ArrayLike = 0, derivatives: int = 1) -> StencilMatrices:
         """Weights of the control points at samples, as sparse matrices: `evaluate` as linear maps.
@@ -187,7 +180,7 @@ class LimitSurface:
         require_derivatives(derivatives)
         half_edge, uv = checked_samples(self.patches, element, uv, corner)
         stencils = partial(derivative_stencils, derivatives=derivatives)
-        return patches.StencilMatrices(*self._matrices(half_edge, uv, stencils, 3 * derivatives))
+        return StencilMatrices(*self._matrices(half_edge, uv, stencils, 3 * derivatives))
 
     def _matrices(
         self,
@@ -197,7 +190,7 @@ class LimitSurface:
         count: int,
     ) -> list[sparse.csr_array]:
         indices = self.cage.cut_mesh.vertex, self.cage.vertex_count
-        return patches.stencil_matrices(self.patches, *indices, half_edge, uv, stencils, count)
+        return stencil_matrices(self.patches, *indices, half_edge, uv, stencils, count)
 
     def evaluate_attribute(self, name: str, element: ArrayLike, uv: ArrayLike, corner: ArrayLike = 0) -> FloatArray:
         """Evaluate an attribute of the cage, exactly: the limit of its refinement.
@@ -249,8 +242,8 @@ class LimitSurface:
             if name not in attributes:
                 expected = f"one of {', '.join(attributes)}" if attributes else "a cage with attributes"
                 raise ValueError(f'{self.cage.source.name} has no attribute "{name}"; expected {expected}')
-            layout = patches.ChannelLayout.of(name, attributes[name], self.cage, self.scheme, self.patches)
-            self._channels[name] = patches.Channel(layout, attributes[name].values)
+            layout = ChannelLayout.of(name, attributes[name], self.cage, self.scheme, self.patches)
+            self._channels[name] = Channel(layout, attributes[name].values)
         return self._channels[name]
 
     @cached_property
@@ -277,7 +270,7 @@ class LimitSurface:
         """
         sizes = self.patches.elements.face_sizes
         chosen = np.flatnonzero(sizes) if element is None else checked_elements(self.patches, element)
-        return patches.ElementBounds(chosen, *(side[chosen] for side in self._bounds))
+        return ElementBounds(chosen, *(side[chosen] for side in self._bounds))
 
     def area(self) -> float:
         """Area of the surface, in squared units of the cage's space.
@@ -319,7 +312,7 @@ class LimitSurface:
         SchemeError
             As `bounds`.
         """
-        return self._energy(patches.gradients, order)
+        return self._energy(gradients, order)
 
     def bending(self, order: int = 4) -> sparse.csr_array:
         """Bending matrix of the surface: thin-plate energy of functions that are subdivided as points are.
@@ -348,12 +341,12 @@ class LimitSurface:
         SchemeError
             As `bounds`.
         """
-        return self._energy(patches.hessians, order)
+        return self._energy(hessians, order)
 
     def _energy(self, density: Density, order: int) -> sparse.csr_array:
         if not isinstance(order, numbers.Integral) or order < 1:
             raise ValueError(f"order {order!r}; expected an integer of 1 or more")
-        return patches.energy_matrix(self.patches, self.cage.cut_mesh.vertex, self.cage.positions, density, int(order))
+        return energy_matrix(self.patches, self.cage.cut_mesh.vertex, self.cage.positions, density, int(order))
 
     def sample(self, count: int, seed: int | np.random.Generator = 0) -> AreaSamples:
         """Draw independent random points, uniform by area.
@@ -375,13 +368,9 @@ class LimitSurface:
             raise ValueError(f"count {count!r}; expected an integer of 0 or more")
         if not self.area() > 0:
             raise ValueError(f"{self.cage.source.name}: the surface has no area; expected one to draw points from")
-        half_edge, uv = patches.uniform_locations(
-            self._surface_pieces, self._areas[0], int(count), np.random.default_rng(seed)
-        )
+        half_edge, uv = uniform_locations(self._surface_pieces, self._areas[0], int(count), np.random.default_rng(seed))
         samples = self._sampler.evaluate(half_edge, uv)
-        return patches.AreaSamples(
-            *self._element_and_corner(half_edge), uv, samples.p, samples.n, samples.dp_du, samples.dp_dv
-        )
+        return AreaSamples(*self._element_and_corner(half_edge), uv, samples.p, samples.n, samples.dp_du, samples.dp_dv)
 
     def closest_point(self, points: ArrayLike) -> ClosestPoints:
         """Find the nearest point of the surface for each given point; where several are nearest, one of them.
@@ -413,11 +402,11 @@ class LimitSurface:
         half_edge, uv = self._closest_point_search.nearest(points)
         samples = self._sampler.evaluate(half_edge, uv)
         distance = np.linalg.norm(points - samples.p, axis=1)
-        return patches.ClosestPoints(*self._element_and_corner(half_edge), uv, samples.p, samples.n, distance)
+        return ClosestPoints(*self._element_and_corner(half_edge), uv, samples.p, samples.n, distance)
 
     @cached_property
     def _surface_pieces(self) -> SurfacePieces:
-        return patches.SurfacePieces.build(self.patches, self.cage.positions[self.cage.cut_mesh.vertex])
+        return SurfacePieces.build(self.patches, self.cage.positions[self.cage.cut_mesh.vertex])
 
     @cached_property
     def _bounds(self) -> tuple[FloatArray, FloatArray]:
@@ -425,14 +414,14 @@ class LimitSurface:
 
     @cached_property
     def _areas(self) -> tuple[list[FloatArray], float]:
-        return patches.surface_areas(self._surface_pieces)
+        return surface_areas(self._surface_pieces)
 
     def _sampling_cells(self) -> SamplingCells:
-        return patches.SamplingCells.build(self._surface_pieces, self._areas[0])
+        return SamplingCells.build(self._surface_pieces, self._areas[0])
 
     @cached_property
     def _closest_point_search(self) -> ClosestPointSearch:
-        return patches.ClosestPointSearch(self._surface_pieces)
+        return ClosestPointSearch(self._surface_pieces)
 
     def _element_and_corner(self, half_edge: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Element and corner of half-edges of `PatchTable.elements`."""
@@ -458,7 +447,7 @@ class LimitSurface:
         """
         if evaluator not in self._pieces:
             levels = {"piece_levels": 0} if evaluator == "stam" else {}
-            self._pieces[evaluator] = patches.PieceTable.build(
+            self._pieces[evaluator] = PieceTable.build(
                 self.patches, self.cage.cut_mesh.vertex, self.cage.vertex_count, **levels
             )
         return self._pieces[evaluator]

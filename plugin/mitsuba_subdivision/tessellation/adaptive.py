@@ -14,7 +14,7 @@ from ..evaluation.polynomials import times
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..messages import counted
-from ..patches import PatchTable
+from ..patches.patch_table import PatchTable
 from ..schemes.domain import FloatArray
 from . import HIGHEST_RATE
 from .adaptive_grid import AdaptiveGrid, PatchFrames, Tiles, sides_of, tile_type, whole_patches

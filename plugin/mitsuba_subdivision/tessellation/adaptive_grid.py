@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.ragged import chunks_of
-from ..patches import PatchTable
+from ..patches.patch_table import PatchTable
 from ..schemes.domain import FloatArray, ParameterDomain
 from .stitching import inner_counts, inner_steps, stitched
 from .uniform_grid import first_sides

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared
-from ..patches import PatchTable
+from ..patches.patch_table import PatchTable
 from ..schemes.domain import FloatArray
 from .uniform import uniform_table
 from .uniform_grid import UniformGrid
 from .vertex_table import VertexTable
 
 if TYPE_CHECKING:
-    from ..patches import Channel, ChannelLayout
+    from ..patches.channel import Channel, ChannelLayout
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from .uniform_grid import UniformGrid
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ..patches import PatchTable
+    from ..patches.patch_table import PatchTable
 
 # Measured peak memory of a uniform tessellation, in bytes: of a vertex, with its point, normal and two triangles, and
 # of a sample of a class of patches.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..evaluation.divided_tile import DividedTile
 from ..evaluation.polynomials import BernsteinBasis, polynomial_basis, times
 from ..mesh.connectivity import IndexArray, IntArray
-from ..patches import PatchTable
+from ..patches.patch_table import PatchTable
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .adaptive_grid import DEEPEST, PatchFrames, Tiles, child, in_patch

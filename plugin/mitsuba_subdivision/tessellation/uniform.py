@@ -11,7 +11,7 @@ import numpy as np
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared
-from ..patches import PatchClass, PatchTable
+from ..patches.patch_table import PatchClass, PatchTable
 from ..schemes.domain import FloatArray
 from .memory import require_memory
 from .uniform_grid import GridPart, UniformGrid, first_sides

@@ -16,7 +16,7 @@ from ..evaluation.patch_tree import patch_tree
 from ..evaluation.polynomials import monomial_values, polynomial_basis
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray
-from ..patches import PatchClass
+from ..patches.patch_table import PatchClass
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 
