@@ -5,7 +5,6 @@ import pytest
 from mitsuba_subdivision.cage import named_cages
 from patches.closed_cages import mixed_torus, polygons, torus
 from peers.fidelity_cages import SURFACES
-from peers.test_fidelity import surface_of
 
 ROUNDING = 1e-12
 pytestmark = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
@@ -14,7 +13,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWa
 @pytest.fixture(params=["mixed torus", "cube", "no manifold, book of three", "no manifold, pole of quads"])
 def cage(request):
     manifolds = {"mixed torus": mixed_torus, "cube": named_cages.cube}
-    return manifolds[request.param]() if request.param in manifolds else surface_of(SURFACES[request.param]).cage
+    return manifolds[request.param]() if request.param in manifolds else SURFACES[request.param]
 
 
 def test_every_edge_is_there_once_and_triangles_cover_the_faces(cage):

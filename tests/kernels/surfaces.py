@@ -1,13 +1,12 @@
 """Surfaces that between them have every kind of piece, and locations on them."""
 
-import warnings
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
 
 import drjit as dr
 import numpy as np
-from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface
+from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.device_arrays import upload
 from patches.closed_cages import (
@@ -28,12 +27,6 @@ RING = ((4, 5), (5, 7), (7, 6), (6, 4))
 UNEQUAL = [(a, b, s) for (a, b), s in zip(RING, (0.4, 1.3, 2.2, 4), strict=True)]
 
 
-def non_manifold():
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CageWarning)
-        return ControlCage(book(3).positions, book(3).faces)
-
-
 SURFACES = {
     "torus": ("catmull_clark", lambda: cage_of("catmull_clark", "torus")),
     "cube": ("catmull_clark", cube),
@@ -49,7 +42,7 @@ SURFACES = {
     "boundary none": ("catmull_clark", lambda: sheet(4, 4, boundary="none")),
     "half disc of 6": ("catmull_clark", lambda: half_disc(6)),
     "holes": ("catmull_clark", lambda: tagged(mixed_torus(), holes=[0, 3])),
-    "non-manifold": ("catmull_clark", non_manifold),
+    "non-manifold": ("catmull_clark", lambda: book(3)),
     "dart": ("catmull_clark", lambda: spokes(extraordinary(5, closed=False), 5, (INFINITE,))),
     "crease": ("catmull_clark", lambda: spokes(trapezohedron(6), 6, (INFINITE, 0, INFINITE))),
     "corner": ("catmull_clark", lambda: spokes(extraordinary(8, closed=False), 8, (INFINITE,) * 3)),

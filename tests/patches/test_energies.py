@@ -6,7 +6,6 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from patches.closed_cages import bumpy, cage_of, mixed_torus, torus
 from peers.fidelity_cages import SURFACES
-from peers.test_fidelity import surface_of
 from reference.refined_cages import refine_first, sheet
 
 # Of sums of entries of about one, and of eigenvalues, beside the largest entry.
@@ -22,11 +21,11 @@ SURFACES_OF_ALL_KINDS = {
     "polygons": lambda: LimitSurface(bumpy(mixed_torus(), size=0.05)),
     "Loop": lambda: LimitSurface(bumpy(cage_of("loop", "bipyramid")), "loop"),
     "Doo-Sabin": lambda: LimitSurface(bumpy(cage_of("doo_sabin", "prism")), "doo_sabin"),
-    "creases": lambda: surface_of(SURFACES["piece, rings 10.0"]),
-    "semi-sharp": lambda: surface_of(SURFACES["crease, semi-sharp on both sides"]),
-    "hole": lambda: surface_of(SURFACES["hole"]),
-    "Loop, open": lambda: surface_of(SURFACES["Loop, semi-sharp crease and corner"]),
-    "no manifold": lambda: surface_of(SURFACES["no manifold, book of three"]),
+    "creases": lambda: LimitSurface(SURFACES["piece, rings 10.0"]),
+    "semi-sharp": lambda: LimitSurface(SURFACES["crease, semi-sharp on both sides"]),
+    "hole": lambda: LimitSurface(SURFACES["hole"]),
+    "Loop, open": lambda: LimitSurface(SURFACES["Loop, semi-sharp crease and corner"]),
+    "no manifold": lambda: LimitSurface(SURFACES["no manifold, book of three"]),
 }
 pytestmark = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
 
@@ -121,7 +120,7 @@ def test_cages_that_are_refined_first_have_the_same_energies(monkeypatch):
 @pytest.mark.parametrize("name", ["sheet without corners", "piece, rings and rims"])
 def test_bending_is_finite_where_that_of_the_surface_is_not(name):
     # Smooth borders with one face at a vertex: curvature grows too fast there to be integrated.
-    surface = surface_of(SURFACES[name])
+    surface = LimitSurface(SURFACES[name])
     assert np.abs(surface.bending() - surface.bending(ORDER)).max() <= 0.05 * np.abs(surface.bending()).max()
 
 

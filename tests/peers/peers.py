@@ -12,20 +12,17 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from mitsuba_subdivision import ControlCage
 from mitsuba_subdivision.figures.peers import as_bytes, from_bytes
 from numpy.typing import ArrayLike, NDArray
 
 SOURCES = [Path(__file__).with_name(name) for name in ("osd_peer.cpp", "peer_common.h")]
 # The answers take milliseconds, and compiling OpenSubdiv's headers with -O3 three times as long as with -O1.
 FLAGS = ["-std=c++17", "-O1", "-DNDEBUG", "-pthread"]
-# Corners of a face that has one domain.
-REGULAR_SIZE = {"catmark": 4, "loop": 3}
 LEVELS = {"far": 10, "refine": 6}
 
 
@@ -66,24 +63,6 @@ def find() -> Path | str:
     return program
 
 
-@dataclass(frozen=True, eq=False)
-class PeerCage:
-    """A control cage with the names that OpenSubdiv has for its options."""
-
-    positions: ArrayLike  # (n_v, 3)
-    faces: Sequence[Sequence[int]]
-    scheme: str = "catmark"  # | "loop"
-    boundary: str = "edge_and_corner"  # | "edge_only" | "none"
-    creases: Sequence[tuple[int, int, float]] = ()  # (vertex, vertex, sharpness)
-    corners: Sequence[tuple[int, float]] = ()  # (vertex, sharpness)
-    holes: Sequence[int] = ()  # Faces.
-    creasing: str = "uniform"  # | "chaikin"
-    triangles: str = "catmark"  # | "smooth"
-    # (n, width) values, and one index of them per corner of all faces, one after the other.
-    fvar: tuple[ArrayLike, ArrayLike] | None = None
-    fvar_linear: str = "all"  # | "none" | "boundaries" | "corners_only" | "corners_plus1" | "corners_plus2"
-
-
 class PeerSamples(NamedTuple):
     """Samples of OpenSubdiv's surface; not a number where it has none."""
 
@@ -105,13 +84,14 @@ class PeerSamples(NamedTuple):
 
 
 def evaluate(
-    cage: PeerCage,
+    cage: ControlCage,
     element: ArrayLike,
     uv: ArrayLike,
     corner: ArrayLike = 0,
     *,
     method: str = "far",
     level: int | None = None,
+    faces: list[list[int]] | None = None,  # In place of the cage's.
 ) -> PeerSamples:
     """Samples of a cage's limit surface; ``element``, ``uv`` and ``corner`` as for `LimitSurface.evaluate`.
 
@@ -121,34 +101,36 @@ def evaluate(
     program = find()
     if not isinstance(program, Path):
         raise PeerError(program)
-    sizes = np.array([len(face) for face in cage.faces])
     element, corner, u, v = np.broadcast_arrays(element, corner, *np.moveaxis(np.asarray(uv, dtype=float), -1, 0))
     element, corner, uv = element.ravel(), corner.ravel(), np.stack([u.ravel(), v.ravel()], axis=1)
-    size = REGULAR_SIZE[cage.scheme]
-    is_whole = sizes[element] == size
+    size = 3 if cage.scheme == "loop" else 4
+    is_whole = cage.face_sizes[element] == size
     turned, back = _from_corner_0(size, uv, np.where(is_whole, corner, 0))
 
-    values, indices = cage.fvar if cage.fvar is not None else (np.zeros((0, 0)), [])
-    values, positions = np.asarray(values, dtype=float), np.asarray(cage.positions, dtype=float)
-    records = {
-        "widths": np.array([3, values.shape[1]], dtype=np.int32),
-        "values": positions,
-        "sizes": sizes.astype(np.int32),
-        "corners": np.concatenate([np.asarray(face, dtype=np.int32) for face in cage.faces]),
-        "creases": np.array([crease[:2] for crease in cage.creases], dtype=np.int32),
-        "edge_sharpness": np.array([crease[2] for crease in cage.creases], dtype=float),
-        "sharp_vertices": np.array([vertex for vertex, _ in cage.corners], dtype=np.int32),
-        "point_sharpness": np.array([sharpness for _, sharpness in cage.corners], dtype=float),
-        "holes": np.array(cage.holes, dtype=np.int32),
+    creases, corners, texcoords = cage.tags.creases(cage.topology), cage.tags.corners(), cage.texcoords
+    values, indices = (np.zeros((0, 0)), []) if texcoords is None else (texcoords.values, texcoords.indices)
+    integers = {
+        "widths": [3, values.shape[1]],
+        "sizes": cage.face_sizes,
+        "corners": cage.face_vertices if faces is None else np.concatenate(faces),
+        "creases": creases[:, :2],
+        "sharp_vertices": corners[:, 0],
+        "holes": cage.holes,
+        "fvar_indices": indices,
+        "face": element,
+        "sub": np.where(is_whole, 0, corner),
+    }
+    floats = {
+        "values": cage.positions,
+        "edge_sharpness": creases[:, 2],
+        "point_sharpness": corners[:, 1],
         "fvar_values": values,
-        "fvar_indices": np.asarray(indices, dtype=np.int32),
-        "face": element.astype(np.int32),
-        "sub": np.where(is_whole, 0, corner).astype(np.int32),
         "uv": turned,
     }
+    records = {name: np.array(numbers, dtype=np.int32) for name, numbers in integers.items()} | floats
     options = {"method": method, "level": LEVELS[method] if level is None else level}
-    options |= {"scheme": cage.scheme, "boundary": cage.boundary, "creasing": cage.creasing}
-    options |= {"triangles": cage.triangles, "fvar": cage.fvar_linear}
+    options |= {"scheme": "loop" if size == 3 else "catmark", "boundary": cage.boundary, "fvar": cage.face_varying}
+    options |= {"creasing": cage.crease_method, "triangles": cage.triangle_rule.replace("catmull_clark", "catmark")}
     with tempfile.TemporaryDirectory() as folder:
         queries, answers = Path(folder, "queries"), Path(folder, "answers")
         queries.write_bytes(as_bytes(records))

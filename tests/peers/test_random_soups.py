@@ -1,14 +1,13 @@
 """Faces thrown together at random, which share edges and vertices in every way, against OpenSubdiv (3.5.0)."""
 
-from dataclasses import replace
-
-import mitsuba_subdivision as msub
 import numpy as np
 import pytest
+from mitsuba_subdivision import Attribute, ControlCage, LimitSurface, SchemeError
+from patches.closed_cages import polygons
 
 from .fidelity_cages import MODES, book, edges_of, scattered
-from .peers import PeerCage, evaluate
-from .test_fidelity import AGAINST_OSD, POINT, box, distance, rounding, surface_of
+from .peers import evaluate
+from .test_fidelity import AGAINST_OSD, POINT, at, box, distance, rounding
 
 pytestmark = AGAINST_OSD
 
@@ -17,12 +16,12 @@ SAMPLES = 60
 CLOSEST = 4
 
 
-def soup(rng: np.random.Generator) -> PeerCage:
+def soup(rng):
     """Some faces over few vertices, with or without tags and face-varying values."""
-    scheme = str(rng.choice(["catmark", "loop"], p=[0.6, 0.4]))
+    scheme = str(rng.choice(["catmull_clark", "loop"], p=[0.6, 0.4]))
     if rng.random() < 0.3:
         cage = book(int(rng.integers(2, 5)), triangles=scheme == "loop")
-        positions, faces = np.asarray(cage.positions), cage.faces
+        positions, faces = cage.positions, polygons(cage.topology)
     else:
         count = int(rng.integers(5, 12))
         positions = rng.uniform(-1, 1, (count, 3))
@@ -32,7 +31,7 @@ def soup(rng: np.random.Generator) -> PeerCage:
         ]
     ends = {tuple(sorted(edge)) for face in faces for edge in edges_of(face) if edge[0] != edge[1]}
 
-    def sharpness() -> float:
+    def sharpness():
         return float(rng.choice([0.5, 1.5, 2.25, 10, 10]))
 
     chosen = rng.permutation(sorted(ends))[: rng.integers(0, 4)]
@@ -46,18 +45,11 @@ def soup(rng: np.random.Generator) -> PeerCage:
     face = int(rng.integers(len(faces)))
     begin = sum(len(f) for f in faces[:face])
     indices[begin : begin + len(faces[face])] += len(positions)
-    values = rng.uniform(0, 1, (2 * len(positions), 2))
-    return PeerCage(positions, faces, scheme, fvar=(values, indices), fvar_linear=str(rng.choice(MODES)), **options)
+    options["texcoords"] = Attribute(rng.uniform(0, 1, (2 * len(positions), 2)), "face_varying", indices)
+    return ControlCage(positions, faces, scheme=scheme, face_varying=str(rng.choice(MODES)), **options)
 
 
-def as_kept(cage: PeerCage) -> PeerCage:
-    """The cage with the faces that are turned here turned for OpenSubdiv, too."""
-    kept = surface_of(cage).cage
-    faces = [face.tolist() for face in np.split(kept.face_vertices, np.cumsum(kept.face_sizes)[:-1])]
-    return replace(cage, faces=faces, fvar=(kept.texcoords.values, kept.texcoords.indices))
-
-
-def has_fans_beside_a_crease(cage: msub.ControlCage) -> bool:
+def has_fans_beside_a_crease(cage):
     """Whether a vertex is held that OpenSubdiv lets move along two edges of many faces; see `ControlCage`."""
     parts, t = cage.non_manifold, cage.topology
     if parts is None:
@@ -75,17 +67,13 @@ def has_fans_beside_a_crease(cage: msub.ControlCage) -> bool:
 def test_points_and_values_of_random_faces(seed):
     cage = soup(np.random.default_rng(seed))
     try:
-        surface = surface_of(cage)
-    except msub.SchemeError as error:
+        surface = LimitSurface(cage)
+    except SchemeError as error:
         assert 'boundary "none" leaves no face' in str(error)  # noqa: PT017 - any other error is one
         return
-    if has_fans_beside_a_crease(surface.cage):
+    if has_fans_beside_a_crease(cage):
         pytest.skip("OpenSubdiv lets a vertex move along a crease that some of its fans do not touch")
-    cage = as_kept(cage)
-    element, uv, corner = scattered(cage, SAMPLES, CLOSEST)
-    there = ~surface.cage.is_hole[element]
-    element, uv, corner = element[there], uv[there], corner[there]
-    theirs = evaluate(cage, element, uv, corner)
-    assert distance(surface.evaluate(element, uv, corner).p, theirs.p).max() <= POINT * rounding(cage) * box(cage)
-    values = surface.evaluate_attribute("texcoords", element, uv, corner)
-    assert distance(values, theirs.fvar).max() <= POINT * rounding(cage)
+    where = at(cage, scattered, (SAMPLES, CLOSEST))
+    theirs = evaluate(cage, *where)
+    assert distance(surface.evaluate(*where).p, theirs.p).max() <= POINT * rounding(cage) * box(cage)
+    assert distance(surface.evaluate_attribute("texcoords", *where), theirs.fvar).max() <= POINT * rounding(cage)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.mesh.cuts import CutMesh
 from mitsuba_subdivision.mesh.shared import Shared
 from mitsuba_subdivision.patches import patch_table
@@ -31,6 +32,12 @@ def half_disc(faces):
 def tagged(cage, **options):
     """The same points and faces with other options of a `ControlCage`, and none of its own."""
     return ControlCage.from_arrays(cage.positions, cage.face_sizes, cage.face_vertices, **options)
+
+
+def changed(cage, **options):
+    """A cage with other options, or arrays, of `ControlCage.from_arrays`, and the others of its own."""
+    with without_warnings():
+        return ControlCage.from_arrays(**{**cage.contents.as_arguments(), **options})
 
 
 def upper_half(ball):

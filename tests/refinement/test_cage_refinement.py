@@ -12,7 +12,6 @@ from mitsuba_subdivision.schemes import Loop
 from patches.closed_cages import SURFACES as CLOSED
 from patches.closed_cages import bumpy, cage_of, mixed_torus, tetrahedron
 from peers.fidelity_cages import ISLANDS, SURFACES, fan, with_islands
-from peers.test_fidelity import surface_of
 from reference.refined_cages import sheet, tagged, with_bumps
 
 # Of points, derivatives and values, all below ten; measured 4e-14.
@@ -83,7 +82,7 @@ def check_refined(surface, rng, of_points=True, times=1):
 
 @pytest.mark.parametrize("name", [name for name in PEERS if name not in {NO_CAGE, *OTHER_MODES, *OTHER_SHARPNESS}])
 def test_the_surface_is_the_same_with_every_feature(name, np_rng):
-    check_refined(surface_of(PEERS[name]), np_rng, of_points=name not in OTHER_SEAMS)
+    check_refined(LimitSurface(PEERS[name]), np_rng, of_points=name not in OTHER_SEAMS)
 
 
 @pytest.mark.parametrize(("scheme", "name"), CLOSED)
@@ -93,7 +92,7 @@ def test_the_surface_is_the_same_under_every_scheme(scheme, name, np_rng):
 
 @pytest.mark.parametrize("name", TWICE)
 def test_a_refined_cage_can_be_refined(name, np_rng):
-    check_refined(surface_of(PEERS[name]), np_rng, times=3)
+    check_refined(LimitSurface(PEERS[name]), np_rng, times=3)
 
 
 @pytest.mark.parametrize(("scheme", "cage"), SEMI_SHARP.values(), ids=SEMI_SHARP)
@@ -112,7 +111,7 @@ def test_points_and_sharpness_are_those_of_the_rules_vertex_by_vertex(scheme, ca
 
 
 def test_any_control_points_have_the_same_surface_through_the_matrix(np_rng):
-    before = surface_of(PEERS["piece, rings and rims"])
+    before = LimitSurface(PEERS["piece, rings and rims"])
     refinement = before.cage.refinement()
     np.testing.assert_array_equal(refinement.matrix @ before.cage.positions, refinement.cage.positions)
     np.testing.assert_allclose(refinement.matrix.sum(axis=1), 1, atol=POINT)
@@ -151,7 +150,7 @@ def test_vertices_keep_their_numbers_and_faces_know_where_they_lie():
 def test_files_of_refined_cages_hold_the_same_surface(name, suffix, tmp_path, np_rng):
     if suffix == "usda":
         pytest.importorskip("pxr")
-    before = surface_of(PEERS[name])
+    before = LimitSurface(PEERS[name])
     refinement = before.cage.refinement(before.scheme.name)
     refinement.cage.save(tmp_path / f"cage.{suffix}")
     after = LimitSurface(ControlCage.from_file(tmp_path / f"cage.{suffix}"), before.scheme)
@@ -188,25 +187,24 @@ def test_values_without_seams_are_refined_under_doo_sabin(np_rng):
 def test_the_rule_for_seams_changes_where_that_keeps_corners(np_rng):
     # Of two islands at a vertex, one is smooth after a refinement, and would be sharpened by the other from then on.
     cage = with_islands(fan(6, creases=[(0, 2, 0.5), (0, 5, 2.0)]), [(0, 1), (0, 4)], "corners_plus1")
-    after = check_refined(surface_of(cage), np_rng)
+    after = check_refined(LimitSurface(cage), np_rng)
     assert after.cage.face_varying == "corners_only"
 
 
 @pytest.mark.parametrize("mode", ["none", "corners_plus1", "boundaries"])
 def test_seams_along_semi_sharp_edges_of_unequal_sharpness_are_kept(mode, np_rng):
     creases = [(0, 1, 2.5), (0, 4, 1.25), (0, 2, 3.0)]
-    cage = with_islands(fan(6, creases=creases, creasing="chaikin"), [(0, 1), (0, 4)], mode)
-    surface = surface_of(cage)
+    cage = with_islands(fan(6, creases=creases, crease_method="chaikin"), [(0, 1), (0, 4)], mode)
+    surface = LimitSurface(cage)
     for _ in range(3):
         surface = check_refined(surface, np_rng)
         assert surface.cage.face_varying == mode
 
 
 def test_corners_that_no_rule_for_seams_gives_are_an_error():
-    one = with_islands(fan(6, creases=[(0, 2, 0.5), (0, 5, 2.0)]), [(0, 1), (0, 4)], "corners_plus1")
+    cage = with_islands(fan(6, creases=[(0, 2, 0.5), (0, 5, 2.0)]), [(0, 1), (0, 4)], "corners_plus1")
     # One of several islands at a vertex is a corner in this mode only.
-    many = with_islands(fan(6), [(0, 1), (0, 3), (0, 5)], "corners_plus1")
-    cage, other = surface_of(one).cage, surface_of(many).cage
+    other = with_islands(fan(6), [(0, 1), (0, 3), (0, 5)], "corners_plus1")
     values, more = cage.texcoords, other.texcoords
     indices = np.concatenate([values.indices, len(values.values) + more.indices])
     both = ControlCage.from_arrays(
@@ -222,7 +220,7 @@ def test_corners_that_no_rule_for_seams_gives_are_an_error():
 
 def test_faces_that_share_two_edges_are_an_error_under_loop():
     with pytest.raises(CageError, match="face 0 and another face share two edges or more"):
-        surface_of(SURFACES[NO_CAGE]).cage.refined("loop")
+        SURFACES[NO_CAGE].refined("loop")
 
 
 def test_a_scheme_with_numbers_of_its_own_is_an_error():
@@ -253,7 +251,7 @@ def test_halves_of_an_edge_from_a_vertex_to_itself_stay_apart(scheme, faces, np_
 
 
 def test_holes_stay_holes_where_the_boundary_makes_them():
-    cage = surface_of(SURFACES["sheet, creases interpolated"]).cage
+    cage = SURFACES["sheet, creases interpolated"]
     refinement = cage.refinement()
     assert cage.is_hole.any()
     np.testing.assert_array_equal(refinement.cage.is_hole, cage.is_hole[refinement.element])

@@ -29,15 +29,11 @@ def triangle_normals(shape):
     return np.cross(b - a, c - a)
 
 
-def of(given):
-    return lambda: ControlCage(given.positions, given.faces)
-
-
 NON_MANIFOLD = {
-    "book": of(book(3)),
-    "cones": of(joined(fan(4), fan(5), {0: 0})),
-    "cubes": of(joined(box(), box(), {0: 7, 1: 6})),
-    "pole": of(pole(5)),
+    "book": lambda: book(3),
+    "cones": lambda: joined(fan(4), fan(5), {0: 0}),
+    "cubes": lambda: joined(box(), box(), {0: 7, 1: 6}),
+    "pole": lambda: pole(5),
 }
 CAGES = {
     "valence 5": lambda: named_cages.extraordinary(5),
