@@ -90,18 +90,6 @@ def test_new_positions_keep_the_class_and_the_topology_and_nothing_that_was_cach
         cage.with_positions(np.where(np.arange(24).reshape(8, 3) == 16, np.nan, 0))
 
 
-@pytest.mark.core
-def test_file_round_trip_is_exact(any_cage, tmp_path):
-    rng = np.random.default_rng(3)
-    scale = 10.0 ** rng.integers(-300, 300, any_cage.positions.shape)
-    cage = any_cage.with_positions(rng.standard_normal(any_cage.positions.shape) * scale)
-    path = tmp_path / "cage.OBJ"
-    cage.save(path)
-    for again in (ControlCage.from_file(path), ControlCage.from_file(str(path))):
-        assert_same(cage, again)
-        assert again.source.name == f'"{path}"'
-
-
 def test_validation_errors_of_a_file_name_its_line(obj_file):
     path = obj_file("# cube\nv 0 0 0\nv 1 0 0\nv 0 1 0\n\nf 1 2 3\nf 1 2 \\\n 3\n")
     with pytest.raises(CageError, match=r'cube\.obj", line 6: face 1 and face 2 \(line 7\) .* edge \(1, 2\)'):
@@ -153,17 +141,6 @@ MANY = Attribute([[0, 0]], "face_varying", np.broadcast_to(0, 10**11))
 def test_malformed_attributes_are_errors_with_their_names(options, message):
     with pytest.raises(CageError, match=message):
         tagged(cube(), **options)
-
-
-def test_a_path_of_a_wrong_type_or_an_unknown_format_or_to_no_file_is_an_error(tmp_path):
-    for call in (ControlCage.from_file, cube().save):
-        with pytest.raises(CageError, match="path 3; expected a str or Path"):
-            call(3)
-        for name, suffix in (("cube.fbx", ".fbx"), ("cube", ""), ("obj", "")):
-            with pytest.raises(CageError, match=f'{name}": unknown cage format "{suffix}"; expected one of .obj'):
-                call(tmp_path / name)
-    with pytest.raises(FileNotFoundError, match=r"missing\.obj"):
-        ControlCage.from_file(tmp_path / "missing.obj")
 
 
 def test_a_cage_of_its_own_contents_is_the_same(np_rng):

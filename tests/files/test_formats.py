@@ -1,30 +1,31 @@
-"""The table of file formats."""
+"""All file formats: what is saved is read back, by other programs as well, and what cannot be is told."""
 
 import gzip
 import subprocess
 import sys
 from types import SimpleNamespace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurface
+from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import Attribute
-from mitsuba_subdivision.cage.contents import CageContents
-from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.files.formats import FORMATS, Format
+from mitsuba_subdivision.cage.contents import RULES, CageContents, same
+from mitsuba_subdivision.cage.named_cages import cube, extraordinary
+from mitsuba_subdivision.files.formats import FORMATS, Format, write_triangles
 from patches.closed_cages import tetrahedron
+from reference.refined_cages import tagged
+
+USD = (".usd", ".usda", ".usdc")
 
 
 def test_a_new_format_is_a_module_and_a_line(monkeypatch, tmp_path):
-    def read(path):
-        arrays = np.load(path)
-        return CageContents(arrays["positions"], arrays["face_sizes"], arrays["face_vertices"])
-
-    def write(contents, path):
-        names = ("positions", "face_sizes", "face_vertices")
-        np.savez(path, **{name: getattr(contents, name) for name in names})
-
-    module = SimpleNamespace(read=read, write=write)
+    names = ("positions", "face_sizes", "face_vertices")
+    module = SimpleNamespace(
+        read=lambda path: CageContents(*np.load(path).values()),
+        write=lambda contents, path: np.savez(path, **{name: getattr(contents, name) for name in names}),
+    )
     monkeypatch.setitem(sys.modules, "mitsuba_subdivision.files.npz", module)
     monkeypatch.setitem(FORMATS, ".npz", Format("npz:read", "npz:write"))
     cube().save(tmp_path / "cube.npz")
@@ -48,8 +49,20 @@ def test_neither_cages_nor_files_are_imported_with_the_package_and_readers_only_
     assert not {"mitsuba_subdivision.files.usd_reader", "pxr", "plyfile"} & (reader | surface)
 
 
+def skip_without_package(suffix):
+    if suffix.lower() != ".obj":
+        pytest.importorskip("plyfile" if suffix == ".ply" else "pxr")
+
+
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_folders_and_circles_of_links_are_named(suffix, tmp_path):
+def test_files_that_are_not_there_folders_and_circles_of_links_are_named(suffix, tmp_path):
+    skip_without_package(suffix)
+    with pytest.raises(FileNotFoundError, match=rf"missing\{suffix}"):
+        ControlCage.from_file(tmp_path / f"missing{suffix}")
+    if FORMATS[suffix].write:
+        with pytest.raises(FileNotFoundError, match=rf'cage\{suffix}": there is no folder ".*missing"'):
+            cube().save(tmp_path / "missing" / f"cage{suffix}")
+    assert list(tmp_path.iterdir()) == []
     folder, link = tmp_path / f"folder{suffix}", tmp_path / f"link{suffix}"
     folder.mkdir()
     with pytest.raises(CageError, match=r'folder\..*" is a folder; expected a file'):
@@ -60,20 +73,13 @@ def test_folders_and_circles_of_links_are_named(suffix, tmp_path):
             ControlCage.from_file(link)
 
 
-def skip_without_package(suffix):
-    if suffix != ".obj":
-        pytest.importorskip("plyfile" if suffix == ".ply" else "pxr")
-
-
-@pytest.mark.parametrize("suffix", FORMATS)
-def test_missing_files_and_folders_are_os_errors(suffix, tmp_path):
-    skip_without_package(suffix)
-    with pytest.raises(FileNotFoundError, match=rf"missing\{suffix}"):
-        ControlCage.from_file(tmp_path / f"missing{suffix}")
-    if FORMATS[suffix].write:
-        with pytest.raises(FileNotFoundError, match=rf'cage\{suffix}": there is no folder ".*missing"'):
-            cube().save(tmp_path / "missing" / f"cage{suffix}")
-    assert list(tmp_path.iterdir()) == []
+def test_a_path_of_a_wrong_type_or_an_unknown_format_is_an_error():
+    for call in (ControlCage.from_file, cube().save):
+        with pytest.raises(CageError, match="path 3; expected a str or Path"):
+            call(3)
+        for path, suffix in (("cube.fbx", ".fbx"), ("cube", ""), ("obj", "")):
+            with pytest.raises(CageError, match=f'{path}": unknown cage format "{suffix}"; expected one of .obj'):
+                call(path)
 
 
 @pytest.mark.parametrize(("suffix", "module", "name"), [(".ply", "plyfile", "plyfile"), (".usda", "pxr", "usd-core")])
@@ -88,10 +94,67 @@ def test_a_missing_package_is_named(suffix, module, name, tmp_path, monkeypatch)
             act(path)
 
 
+@pytest.mark.parametrize(("option", "suffix"), [({"prim": "/a"}, ".obj"), ({"time": 0}, ".ply")])
+def test_options_of_usd_files_are_errors_elsewhere(tmp_path, option, suffix):
+    cube().save(tmp_path / f"cube{suffix}")
+    (given,) = option.items()
+    with pytest.raises(CageError, match="{} {!r} was given; expected it for USD files only".format(*given)):
+        ControlCage.from_file(tmp_path / f"cube{suffix}", **option)
+
+
+# Names that look like those of other columns.
+NAMES_IN_PLY = ("alpha", "weight", "weight_0", "r", "u", "b_x", "x")
+
+
+def with_all_data(cage, suffix, number, rng):
+    """A cage of random numbers with all that files of a format hold, in their precision."""
+    count, corners, faces = cage.vertex_count, len(cage.face_vertices), cage.face_count
+
+    def numbers(*shape, exponent=0):
+        values = rng.normal(size=shape) * 10.0 ** rng.integers(-exponent, exponent + 1, shape)
+        return values.astype(np.float32) if suffix in USD else values
+
+    sharp = [(*cage.face_vertices[:2].tolist(), 2.5), (*cage.face_vertices[1:3].tolist(), 12)]
+    data = {"creases": sharp, "corners": [(2, 10), (0, 1.25)], "holes": [0] * (faces > 1)}
+    data["texcoords"] = Attribute(numbers(5, 2), "face_varying", rng.integers(5, size=corners))
+    if suffix in USD:
+        attributes = {"displayColor": Attribute(numbers(count, 3)), "weight": Attribute(numbers(count, 1), "varying")}
+        attributes |= {"mask": Attribute(numbers(corners, 4), "face_varying"), "a:deep": Attribute(numbers(count, 7))}
+        data |= {"scheme": "loop", "attributes": attributes}
+    elif suffix == ".ply":
+        sizes = {**dict.fromkeys(NAMES_IN_PLY, 1), "color": (1, 3, 4)[number % 3], "flow": 12}
+        attributes = {name: Attribute(numbers(count, size)) for name, size in sizes.items()}
+        owner = rng.integers(-1, 3, faces)
+        numbers_of = {"": -1, "material_0": 0, "material_12": 1, "material_2": 2}
+        materials = {name: np.flatnonzero(owner == number) for name, number in numbers_of.items() if number in owner}
+        data = {"texcoords": Attribute(numbers(count, 2)), "attributes": attributes, "materials": materials}
+    return numbers(count, 3, exponent=30), cage.face_sizes, cage.face_vertices, data
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("suffix", [".OBJ", ".ply", *USD])
+def test_what_is_saved_is_read_back(any_cage, suffix, tmp_path, np_rng):
+    """Bit by bit, with every rule that tags of OBJ and tokens of USD stand for; what was there is replaced."""
+    skip_without_package(suffix)
+    path = tmp_path / f"cage{suffix}"
+    for number in range(1, 1 + {".OBJ": 6, ".ply": 3, ".usda": 6}.get(suffix, 1)):
+        *arrays, data = with_all_data(any_cage, suffix, number, np_rng)
+        chosen = {rule: values[number % len(values)] for rule, values in RULES.items()} if suffix != ".ply" else {}
+        if suffix in USD:
+            chosen["crease_method"] = "uniform"
+        cage = ControlCage.from_arrays(*arrays, **data, **chosen)
+        cage.save(path)
+        again = ControlCage.from_file(str(path) if number == 1 else path)
+        assert same(again.contents, cage.contents)
+        assert suffix in USD or list(again.attributes) == list(cage.attributes)
+        assert again.source.name.startswith(f'"{path}"')
+    assert list(tmp_path.iterdir()) == [path]
+
+
 ONE, TWO = (Attribute(np.zeros((4, size))) for size in (1, 2))
 TAGS = {"creases": [(0, 1, 2)], "corners": [(0, 2)], "holes": [1]}
-RULES = {"boundary": "edge_only", "triangle_rule": "smooth", "scheme": "loop"}
 OF_CORNERS = {"texcoords": Attribute(np.zeros((12, 2)), "face_varying")}
+CHOSEN = {"boundary": "edge_only", "triangle_rule": "smooth", "scheme": "loop"}
 VARYING = {"a b": ONE, "kept": ONE, "v": Attribute(np.zeros((4, 1)), "varying")}
 # What a cage has, what of it has no place in a file, and which attributes are read back.
 NO_PLACE = {
@@ -101,7 +164,7 @@ NO_PLACE = {
         [],
     ),
     ".ply": (
-        {**TAGS, **RULES, **OF_CORNERS, "attributes": VARYING},
+        {**TAGS, **OF_CORNERS, **CHOSEN, "attributes": VARYING},
         'creases, corners, holes, boundary, triangle_rule, scheme, texcoords, attribute "a b", attribute "v"',
         ["kept"],
     ),
@@ -123,6 +186,9 @@ def test_a_warning_names_what_has_no_place(suffix, tmp_path):
         cage.save(tmp_path / f"cage{suffix}")
     again = ControlCage.from_file(tmp_path / f"cage{suffix}")
     assert (again.texcoords, list(again.attributes)) == (None, kept)
+    triangles = LimitSurface(cube()).tessellate(1)
+    with pytest.warns(CageWarning, match=f'{suffix} files have no place for attribute "a b"'):
+        save(tmp_path / f"a{suffix}", triangles, None, {"a b": np.zeros((len(triangles.positions), 1))})
 
 
 OTHER_FILES = {
@@ -140,3 +206,145 @@ def test_an_obj_file_that_is_something_else_is_called_that(content, what, tmp_pa
     path.write_bytes(content)
     with pytest.raises(CageError, match=what):
         ControlCage.from_file(path)
+
+
+def named(cage):
+    return {name: faces.tolist() for name, faces in cage.materials.items()}
+
+
+def test_materials_of_obj_files_have_names(tmp_path):
+    materials = {"": [0], "red 100%": [1, 4], "großes Glas": [2, 3, 5]}
+    tagged(cube(), materials=materials).save(tmp_path / "cage.obj")
+    again = ControlCage.from_file(tmp_path / "cage.obj")
+    assert [*named(again).values()] == [*materials.values()]
+    again.save(tmp_path / "again.obj")
+    assert named(ControlCage.from_file(tmp_path / "again.obj")) == named(again)
+    with pytest.warns(CageWarning, match='no place for material "a # b", further materials of a face of the cage'):
+        tagged(cube(), materials={"a": [0, 1], "a # b": [1]}).save(tmp_path / "cage.obj")
+    assert named(ControlCage.from_file(tmp_path / "cage.obj")) == {"": [1, 2, 3, 4, 5], "a": [0]}
+
+
+def test_materials_of_ply_files_have_numbers(tmp_path):
+    skip_without_package(".ply")
+    with pytest.warns(CageWarning, match='no place for the name of material "red" of the cage; written'):
+        tagged(cube(), materials={"red": [1], "material_0": [2]}).save(tmp_path / "cage.ply")
+    expected = {"": [0, 3, 4, 5], "material_0": [2], "material_1": [1]}
+    assert named(ControlCage.from_file(tmp_path / "cage.ply")) == expected
+
+
+# Triangles
+
+
+@pytest.fixture(scope="module")
+def triangles():
+    return LimitSurface(extraordinary(5)).tessellate(3)
+
+
+def data_of(triangles, np_rng):
+    count = len(triangles.positions)
+    return np_rng.random((count, 2)), {"color": np_rng.random((count, 3)), "weight": np_rng.random((count, 1))}
+
+
+def save(path, triangles, *data):
+    write_triangles(path, triangles.positions, triangles.normals, triangles.triangles, *data)
+
+
+# Of OBJ files, Mitsuba numbers vertices anew, and its parser of numbers is right to a few units in the last place.
+@pytest.mark.parametrize(
+    ("kind", "options", "rtol", "atol"), [("ply", {}, 1e-7, 1e-6), ("obj", {"flip_tex_coords": False}, 1e-6, 1e-7)]
+)
+def test_mitsuba_reads_files(tmp_path, triangles, variant_scalar_rgb, np_rng, kind, options, rtol, atol):  # noqa: ARG001
+    texcoords, attributes = data_of(triangles, np_rng)
+    path = tmp_path / f"surface.{kind}"
+    save(path, triangles, texcoords, attributes if kind == "ply" else None)
+    shape = mi.traverse(mi.load_dict({"type": kind, "filename": str(path), **options}))
+    faces, corners = np.array(shape["faces"]), triangles.triangles.ravel()
+    assert kind == "obj" or np.array_equal(faces, corners)
+    for name, values in (("positions", triangles.positions), ("normals", triangles.normals), ("texcoords", texcoords)):
+        read = np.array(shape[f"vertex_{name}"]).reshape(-1, values.shape[1])[faces]
+        np.testing.assert_allclose(read, values[corners], rtol=rtol, atol=atol)
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("with_texcoords", [False, True])
+def test_obj_files_keep_every_bit(tmp_path, triangles, np_rng, dtype, with_texcoords):
+    count = len(triangles.positions)
+    positions = (np_rng.normal(size=(count, 3)) * 10.0 ** np_rng.integers(-30, 30, (count, 3))).astype(dtype)
+    texcoords = np_rng.random((count, 2)).astype(dtype) if with_texcoords else None
+    path = tmp_path / "surface.obj"
+    write_triangles(path, positions, triangles.normals, triangles.triangles, texcoords)
+    cage = ControlCage.from_file(path)
+    np.testing.assert_array_equal(cage.positions.astype(dtype), positions)
+    np.testing.assert_array_equal(cage.face_vertices, triangles.triangles.ravel())
+    if with_texcoords:
+        corners = cage.texcoords.values[cage.texcoords.indices]
+        np.testing.assert_array_equal(corners.astype(dtype), texcoords[triangles.triangles.ravel()])
+    normals = np.loadtxt(line[3:] for line in path.read_text().splitlines() if line.startswith("vn "))
+    np.testing.assert_array_equal(normals, triangles.normals)
+
+
+@pytest.mark.parametrize("suffix", [".usd", ".usda", ".usdc"])
+def test_usd_reads_usd_files(tmp_path, triangles, np_rng, suffix):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    texcoords, attributes = data_of(triangles, np_rng)
+    path = tmp_path / f"surface{suffix}"
+    save(path, triangles, texcoords, attributes)
+    stage = Usd.Stage.Open(str(path))
+    mesh = UsdGeom.Mesh(stage.GetDefaultPrim())
+    assert (mesh.GetSubdivisionSchemeAttr().Get(), mesh.GetNormalsInterpolation()) == ("none", "vertex")
+    np.testing.assert_array_equal(mesh.GetPointsAttr().Get(), triangles.positions.astype(np.float32))
+    np.testing.assert_array_equal(mesh.GetNormalsAttr().Get(), triangles.normals.astype(np.float32))
+    np.testing.assert_array_equal(mesh.GetFaceVertexCountsAttr().Get(), np.full(len(triangles.triangles), 3))
+    np.testing.assert_array_equal(mesh.GetFaceVertexIndicesAttr().Get(), triangles.triangles.ravel())
+    primvars = UsdGeom.PrimvarsAPI(mesh)
+    for name, values in {"st": texcoords, **attributes, "weight": attributes["weight"][:, 0]}.items():
+        np.testing.assert_array_equal(primvars.GetPrimvar(name).Get(), values.astype(np.float32))
+    assert primvars.GetPrimvar("st").GetInterpolation() == "vertex"
+    extent = [triangles.positions.min(axis=0), triangles.positions.max(axis=0)]
+    np.testing.assert_allclose(mesh.GetExtentAttr().Get(), extent, rtol=1e-6)
+
+
+def test_command(tmp_path, capsys):
+    cube().save(tmp_path / "cube.obj")
+    words = ["tessellate", str(tmp_path / "cube.obj"), "--rate", "2", "-o"]
+    assert main([*words, str(tmp_path / "out.ply")]) == 0
+    assert capsys.readouterr().out == f"{tmp_path / 'out.ply'}: 48 triangles, 26 vertices\n"
+    cage = ControlCage.from_file(tmp_path / "out.ply")
+    expected = LimitSurface(cube()).tessellate(2)
+    np.testing.assert_array_equal(cage.positions, expected.positions.astype(np.float32))
+    np.testing.assert_array_equal(cage.face_vertices, expected.triangles.ravel())
+    # With every digit.
+    assert main([*words, str(tmp_path / "out.obj")]) == 0
+    np.testing.assert_array_equal(ControlCage.from_file(tmp_path / "out.obj").positions, expected.positions)
+    expected.save(tmp_path / "saved.obj")
+    assert (tmp_path / "saved.obj").read_bytes() == (tmp_path / "out.obj").read_bytes()
+
+
+def test_command_chooses_scheme_mesh_and_time(tmp_path, capsys):
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    path = tmp_path / "cages.usda"
+    stage = Usd.Stage.CreateNew(str(path))
+    for name, cage in (("cube", cube()), ("tetrahedron", tetrahedron())):
+        mesh = UsdGeom.Mesh.Define(stage, f"/{name}")
+        for time in (1, 2):
+            mesh.CreatePointsAttr().Set((time * cage.positions).astype(np.float32), time)
+        mesh.CreateFaceVertexCountsAttr(cage.face_sizes.astype(np.int32))
+        mesh.CreateFaceVertexIndicesAttr(cage.face_vertices.astype(np.int32))
+    mesh.CreateSubdivisionSchemeAttr("loop")
+    stage.Save()
+    words = ["tessellate", str(path), "-o", str(tmp_path / "out.ply"), "--rate", "2"]
+    assert main(words) == 1
+    assert "there are 2 meshes; expected prim to name one of /cube, /tetrahedron" in capsys.readouterr().err
+    assert main([*words, "--prim", "/tetrahedron", "--time", "2"]) == 0
+    loop = LimitSurface(tetrahedron(), "loop").tessellate(2)
+    np.testing.assert_allclose(ControlCage.from_file(tmp_path / "out.ply").positions, 2 * loop.positions, atol=1e-6)
+    assert main([*words, "--prim", "/tetrahedron", "--scheme", "catmull_clark"]) == 0
+    message = f'mitsuba-subdivision: warning: "{path}", prim /tetrahedron: subdivisionScheme is "loop"; '
+    assert capsys.readouterr().err.startswith(message)
+    assert main(["tessellate", str(path), "-o", str(tmp_path / "out.txt")]) == 1
+    assert 'unknown format ".txt" of triangles; expected one of .obj, .ply, .usd' in capsys.readouterr().err

@@ -123,7 +123,7 @@ def obj_files(tails):
 
 
 @given(content=st.sampled_from(TAILS).flatmap(obj_files))
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_agrees_with_a_reader_of_lines(content, obj_file):
     assert_reads_as(content, obj_file(content))
 
@@ -132,10 +132,10 @@ def test_agrees_with_a_reader_of_lines(content, obj_file):
     "statement", ["v 0 0 {}", "vt {} 0", "f 1 2 {}", "f 1/{} 2 3", "t hole {}/0/0 1", "t hole 1/0/0 {}"]
 )
 @pytest.mark.parametrize("end", ["x", "-"])
-def test_a_million_digits_are_read_as_fast_as_any_text(obj_file, statement, end):
-    """It would take days with a search that goes back for each digit."""
+def test_many_digits_are_read_as_fast_as_any_text(obj_file, statement, end):
+    """It would take hours with a search that goes back for each digit."""
     with pytest.raises(CageError, match="line 5: ") as caught:
-        ControlCage.from_file(obj_file(TRIANGLE + "f 1 2 3\n" + statement.format("9" * 1_000_000 + end) + "\n"))
+        ControlCage.from_file(obj_file(TRIANGLE + "f 1 2 3\n" + statement.format("9" * 300_000 + end) + "\n"))
     assert len(str(caught.value)) < 600
 
 

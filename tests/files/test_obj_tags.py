@@ -5,10 +5,9 @@ import time
 import numpy as np
 import pytest
 from mitsuba_subdivision import CageError, CageWarning, ControlCage
-from mitsuba_subdivision.cage import Attribute, contents
+from mitsuba_subdivision.cage import contents
 from mitsuba_subdivision.cage.contents import same
 from mitsuba_subdivision.cage.named_cages import extraordinary
-from reference.exact_samples import faces_of
 
 SHEET = "v 0 0 0\nv 1 0 0\nv 2 0 0\nv 0 1 0\nv 1 1 0\nv 2 1 0\nf 1 2 5 4\nf 2 3 6 5\n"
 
@@ -29,13 +28,17 @@ def sharp_edges(cage):
     return sorted(tuple(sorted(edge)) for edge in ends.tolist())
 
 
-def test_vertices_of_tags_count_from_0_and_a_sharpness_of_0_is_smooth_and_an_infinite_one_sharp(read):
+def test_items_of_tags_count_from_0(read):
+    """A sharpness of 0 is smooth, and one of 10 and more is infinite."""
     cage = read("t crease 2/1/0 4 1 10\nt corner 1/1/0 2 10.0\n")
     assert (sharp_edges(cage), np.flatnonzero(cage.tags.is_corner).tolist()) == ([(1, 4)], [2])
     cage = read("t crease 2/1/0 1 4 0\nt corner 1/1/0 1 0\n")
-    assert not cage.tags.is_infinite.any()
-    assert not cage.tags.is_corner.any()
+    assert not cage.tags.any
     assert read("t corner 1/1/0 0 1e400\n").tags.is_corner[0]
+    cage = read("t crease 4/1/0 1 4 0 1 2.5\nt crease 4/2/0 1 2 0 3 3 4\nt corner 2/1/0 0 2 1.5\nt hole 1/0/0 1\n")
+    sharpness_of = {tuple(sorted(edge)): sharpness for *edge, sharpness in cage.contents.creases.tolist()}
+    assert sharpness_of == {(1, 4): 2.5, (0, 1): 2.5, (1, 2): 3, (0, 3): 4}
+    assert (cage.contents.corners.tolist(), cage.holes.tolist()) == ([[0, 1.5], [2, 1.5]], [1])
 
 
 # As OpenSubdiv's regression/common/far_utils.h reads them.
@@ -64,15 +67,6 @@ def test_corners_propagate_with_their_rule_only(read):
     assert read(text.format(2)).face_varying == "corners_plus2"
     with pytest.warns(CageWarning, match='line 9: tag "facevaryingpropagatecorners" has no effect .* rule "all"'):
         assert read(text.format(5)).face_varying == "all"
-
-
-def test_tags_of_several_items(read):
-    cage = read("t crease 4/1/0 1 4 0 1 2.5\nt crease 4/2/0 1 2 0 3 3 4\nt corner 2/1/0 0 2 1.5\n")
-    sharpness_of = {tuple(sorted(edge)): sharpness for *edge, sharpness in cage.contents.creases.tolist()}
-    assert sharpness_of == {(1, 4): 2.5, (0, 1): 2.5, (1, 2): 3, (0, 3): 4}
-    assert cage.contents.corners.tolist() == [[0, 1.5], [2, 1.5]]
-    # Faces count from 0.
-    assert read("t hole 1/0/0 1\n").holes.tolist() == [1]
 
 
 UNSUPPORTED, UNKNOWN = "is not supported and has no effect", "has an unknown value .* expected one of {}$"
@@ -142,51 +136,26 @@ def test_tags_of_what_no_face_has_are_ignored_and_told(read, tag, message, edges
     assert (sharp_edges(cage), np.flatnonzero(cage.tags.is_corner).tolist()) == (edges, corners)
 
 
-@pytest.mark.core
-@pytest.mark.parametrize(
-    "rules",
-    [
-        {},
-        {"boundary": "edge_only", "face_varying": "none", "crease_method": "chaikin", "triangle_rule": "smooth"},
-        {"boundary": "none", "face_varying": "corners_plus2"},
-        *({"face_varying": rule} for rule in ("corners_only", "boundaries", "all")),
-    ],
-)
-def test_tags_and_texture_coordinates_survive_saving(tmp_path, np_rng, rules):
-    cage = extraordinary(5, closed=False)
-    tags = {"creases": [(0, 1, 0.3), (0, 2, 12)], "corners": [(3, 1 / 3)], "holes": [4, 2]}
-    corners = len(cage.face_vertices)
-    texcoords = Attribute(np_rng.normal(size=(7, 2)), "face_varying", np_rng.integers(7, size=corners))
-    cage = ControlCage(cage.positions, faces_of(cage), texcoords=texcoords, **tags, **rules)
-    cage.save(tmp_path / "cage.obj")
-    assert same(ControlCage.from_file(tmp_path / "cage.obj").contents, cage.contents)
-
-
 def test_many_tags_are_read_as_one_by_one(tmp_path):
     """Lines of the most common form take array passes; here each has a twin in another form, which does not."""
-    rng = np.random.default_rng(3)
-    cage = extraordinary(7)
-    tags = []
+    rng, cage = np.random.default_rng(3), extraordinary(7)
+    tags = [(f"t hole 1/0/0 {face}\n", f"t hole 1/0/0  +{face}\n") for face in range(3)]
     for a, b in cage.edges[rng.integers(0, len(cage.edges), 40)].tolist():
-        sharpness = rng.uniform(0, 12)
-        tags.append((f"t crease 2/1/0 {a} {b} {sharpness!r}\n", f"t  crease\t2/1/0 {a} {b} {sharpness!r}\n"))
+        crease = f"{a} {b} {rng.uniform(0, 12)!r}\n"
+        tags.append((f"t crease 2/1/0 {crease}", f"t  crease\t2/1/0 {crease}"))
     for vertex in rng.integers(0, cage.vertex_count, 20).tolist():
         corner = f"{vertex} {vertex}e-1"
         tags.append((f"t corner 1/1/0 {corner}\n", f"t corner  1/1/0 {corner} # a comment\n"))
-    tags += [(f"t hole 1/0/0 {face}\n", f"t hole 1/0/0  +{face}\n") for face in range(3)]
-    plain, other = zip(*tags, strict=True)
-    order = rng.permutation(len(plain))
-    # Mixed, too, as the last of several tags of an edge counts.
-    mixed = np.where(rng.random(len(plain)) < 0.5, plain, other)
+    plain, other = np.array(tags)[rng.permutation(len(tags))].T
     cages = []
-    for lines in (plain, other, mixed):
+    # Mixed, too, as the last of several tags of an edge counts.
+    for lines in (plain, other, np.where(rng.random(len(tags)) < 0.5, plain, other)):
         cage.with_positions(cage.positions).save(tmp_path / "cage.obj")
         with open(tmp_path / "cage.obj", "a") as file:
-            file.writelines(lines[i] for i in order)
+            file.writelines(lines)
         cages.append(ControlCage.from_file(tmp_path / "cage.obj"))
-    for cage in cages[1:]:
-        assert same(cage.contents, cages[0].contents)
-        assert same(cage.source.tag_lines, cages[0].source.tag_lines)
+    for again in cages[1:]:
+        assert same((again.contents, again.source.tag_lines), (cages[0].contents, cages[0].source.tag_lines))
 
 
 def test_a_malformed_line_among_many_tags_is_named(read):

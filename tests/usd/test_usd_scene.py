@@ -36,6 +36,7 @@ DIRECT = {"integrator": {"type": "direct"}}
 SMOOTH_SQUARE = SQUARE.replace("none", "catmullClark")
 NORMALIZED, POINT = "bool inputs:normalize = 1", "bool treatAsPoint = 1"
 CONE = "float inputs:shaping:cone:angle = "
+SHEET = [(0, 0, 0), (1, 0, 0), (2, 0, 0), (0, 1, 0), (1, 1, 0), (2, 0.5, 0)]
 RESOLUTION = "uniform int2 resolution = (40, 20)"
 NAMED = 'renderSettingsPrimPath = "/settings"'
 COLORED = "color3f inputs:diffuseColor.connect = </paint/texture.outputs:rgb>"
@@ -83,57 +84,63 @@ def instancer(places, prototype, *more):
 
 
 def test_transforms_are_composed(stage):
-    """The same points as with the matrix of the whole stack, for a limit surface and for polygons."""
+    """The points of a limit surface and of polygons are those of the cage in the world."""
     steps = moved(translateX="", scale=(2, -1, 0.5)).replace("X = ", "X.timeSamples = { 1: 0, 3: 4 }")
     inner = prim("Xform", "b", steps, mesh("smooth", CUBE), mesh("flat", CUBE, POLYGONS))
     path = stage(prim("Xform", "a", moved(translate=(1, 2, 3), rotateZ=30), inner))
-    scene = mi.load_dict(msub.usd_scene(path, mi, time=2, tessellation_rate=8))
-    shapes = {shape.id(): shape for shape in scene.shapes()}
+    entries = msub.usd_scene(path, mi, time=2, tessellation_rate=8)
     cage = msub.ControlCage.from_file(path, prim="/a/b/smooth", time=2)
     alone = mi.load_dict({"type": "subdivision", **cage.as_properties(mi)})
+    scene = mi.load_dict(entries)
+    shapes = {shape.id(): shape for shape in scene.shapes()}
     # Vertices may come in another order, as the faces of a mirrored cage are turned.
-    expected, placed = positions(alone), positions(shapes["a_b_smooth"])
-    np.testing.assert_allclose(np.sort(placed, axis=0), np.sort(expected, axis=0), atol=2e-6)
-    c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
-    corners = np.array([[x, y, z] for x in (0, 4) for y in (-1, 1) for z in (-0.5, 0.5)])
-    corners = corners @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) + [1, 2, 3]
-    flat = next(shape for shape in scene.shapes() if shape.vertex_count() == 8)
-    np.testing.assert_allclose(np.sort(positions(flat), axis=0), np.sort(corners, axis=0), atol=2e-6)
+    for placed, expected in ((shapes["a_b_smooth"], positions(alone)), (entries["a_b_flat"], cage.positions)):
+        np.testing.assert_allclose(np.sort(positions(placed), axis=0), np.sort(expected, axis=0), atol=2e-6)
     # The outside is where it was.
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(2.7, 3, 20), mi.Vector3f(0, 0, -1)))
     assert min(np.array(normal).ravel()[2] for normal in (si.n, si.sh_frame.n)) > 0.9
 
 
-@pytest.mark.parametrize("interpolation", ["constant", "vertex"])
-def test_instances_look_like_copies(scene, interpolation, variant_llvm_ad_rgb):  # noqa: ARG001
-    places, size = [(-0.5, 0.2, 0), (0.5, -0.3, 0.4)], (0.3, 0.3, 0.3)
-    many = "(1,0,0), (0,1,0), (0,0,1), (1,1,0), (1,0,1), (0,1,1), (1,1,1), (0,0,0)"
-    values = many if interpolation == "vertex" else "(1, 0.5, 0)"
-    body = f'{CUBE}color3f[] primvars:displayColor = [{values}] (interpolation = "{interpolation}")\n'
-    content = mesh("cube", body) + mesh("flat", body.replace("-1", "-0.4"), POLYGONS)
-    steps = [(f"i{number}", moved(translate=place, scale=size)) for number, place in enumerate(places)]
-    copies = "".join(prim("Xform", name, step, content) for name, step in steps)
-    instances = "".join(instance(name, "/class_of", step) for name, step in steps)
-    instances += prim("Xform", "class_of", content).replace("def", "class", 1)
-    scales = f"float3[] scales = {[size, (1, 1, 1), size]}"
+CREASES = "int[] creaseIndices = [0, 1, 3]\nint[] creaseLengths = [3]\nfloat[] creaseSharpnesses = [2.5]\n"
+TAGS = f"{CREASES}int[] cornerIndices = [7]\nfloat[] cornerSharpnesses = [10]\nint[] holeIndices = [3]\n"
+CORNER_TEXCOORDS = f"""texCoord2f[] primvars:st = [{", ".join(["(0,0), (1,0), (1,1), (0,1)"] * 6)}] (
+    interpolation = "faceVarying" )\n"""
+VERTEX_DATA = f"""normal3f[] normals = [(0,0,1), (0,1,0), (1,0,0), (0,0,1), (0,1,0), (1,0,0), (0,0,1), (1,0,0)]
+    texCoord2f[] primvars:st = [(0,0), (1,0), (1,1), (0,1), (0,0), (1,0), (1,1), (0,1)] ( interpolation = "vertex" )
+    {POLYGONS}"""
+CORNER_COLORS = [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, 1), (0, 1, 1), (1, 1, 1), (0, 0, 0)]
+
+
+@pytest.mark.parametrize(("variant", "colors"), [("llvm_ad_rgb", [(1, 0.5, 0)]), ("scalar_rgb", CORNER_COLORS)])
+def test_instances_look_like_copies(scene, monkeypatch, request, variant, colors):
+    """By reference, of an instancer that leaves one out, and in one shape in place of many; one is mirrored."""
+    request.getfixturevalue(f"variant_{variant}")
+    interpolation = "vertex" if variant == "scalar_rgb" else "constant"
+    places, sizes = [(-0.5, 0.2, 0), (0.5, -0.3, 0.4)], [(0.3, 0.3, 0.3), (-0.3, 0.3, 0.3)]
+    color = f'{COLORS} {colors} (interpolation = "{interpolation}")'
+    content = mesh("smooth", CUBE, TAGS, CORNER_TEXCOORDS, color)
+    content += mesh("flat", CUBE.replace("-1", "-0.4"), VERTEX_DATA, color)
+    steps = {f"i{n}": moved(translate=places[n], scale=sizes[n]) for n in (0, 1)}
+    copies = "".join(prim("Xform", name, step, content) for name, step in steps.items())
+    instances = prim("Xform", "class_of", content).replace("def", "class", 1)
+    instances += "".join(instance(name, "/class_of", step) for name, step in steps.items())
     unseen = "int64[] ids = [5, 6, 7]\nint64[] invisibleIds = [6]"
-    points = instancer([places[0], (9, 9, 9), places[1]], content, scales, unseen)
-    pictures, kinds, names = [], [], []
-    for text in (copies, instances, points):
-        entries = {**scene(CAMERA + SUN + text, size=(32, 32)), **DIRECT}
-        names.append({name for name in entries if name.startswith(("i", "points"))} - {"integrator"})
-        loaded = mi.load_dict(entries)
-        kinds.append(sorted({type(shape).__name__ for shape in loaded.shapes()}))
-        pictures.append(np.array(mi.render(loaded, spp=4))[..., :3])
-    assert pictures[0].max() > 0.2
+    points = [places[0], (9, 9, 9), places[1]], content, f"float3[] scales = {[sizes[0], (1, 1, 1), sizes[1]]}", unseen
+    look = {"type": "aov", "aovs": "uv:uv,n:sh_normal", "img": {"type": "direct"}}
+    pictures, names = [], []
+    for text, least in ((copies, 3), (instances, 3), (instancer(*points), 3), (instancer(*points), 2)):
+        monkeypatch.setattr("mitsuba_usd.copies.LEAST_INSTANCES", least)
+        entries = {**scene(CAMERA + SUN + text, size=(24, 24)), "integrator": look}
+        names.append({name for name in entries if re.match(r"i\d|points|copies", name)})
+        pictures.append(np.array(mi.render(mi.load_dict(entries), spp=4)))
     # Mitsuba looks up attributes of instances in the wrong place.
-    assert (kinds[0] == kinds[1]) == (interpolation == "vertex")
-    assert kinds[1] == kinds[2]
-    if interpolation == "vertex":
-        assert names[0] == names[1] == {"i0_cube", "i0_flat", "i1_cube", "i1_flat"}
-        assert names[2] == {"points_0_cube", "points_0_flat", "points_2_cube", "points_2_flat"}
-    else:
-        assert names[1:] == [{"i0", "i1"}, {"points_0", "points_2"}]
+    parts = ["_smooth", "_flat"] if interpolation == "vertex" else [""]
+    of_parts = [{f"{name}{part}" for name in pair for part in parts} for pair in (steps, ("points_0", "points_2"))]
+    # In scalar variants, many instances take no longer.
+    in_one = {"copies_0_smooth", "copies_0_flat"}
+    assert names[1:] == [*of_parts, in_one if variant == "llvm_ad_rgb" else of_parts[1]]
+    assert pictures[0][..., :3].max() > 0.2
+    assert np.ptp(pictures[0][..., 3:5], axis=(0, 1)).min() > 0.2
     for other in pictures[1:]:
         # Rays meet instances in their own space, which rounds otherwise.
         assert np.mean(np.abs(other - pictures[0]) > 1e-3) < 0.01
@@ -193,50 +200,74 @@ def test_instances_that_differ_look_like_prims_that_do(scene, difference):
     assert np.mean(np.abs(plain - instanced) > 1e-3) < 0.01
 
 
-# Of transforms, cameras, lights, materials, shapes without a mesh, subsets and visibility: a value and another one.
+ST = [(0, 0), (1, 0), (1, 1)]
+# Of prims of these kinds: attributes with a value and another one.
 VALUES = {
-    "double3 xformOp:translate": ("(0, 0, 10)", "(0, 0, 20)"),
-    "float focalLength": ("70", "50"),
-    "token projection": ('"orthographic"', '"perspective"'),
-    "float inputs:intensity": ("3", "1"),
-    "float inputs:radius": ("2", "0.5"),
-    "color3f inputs:diffuseColor": ("(1, 0, 0)", "(0, 1, 0)"),
-    "double size": ("1", "2"),
-    "int[] indices": ("[0, 1]", "[2]"),
-    "token visibility": ('"invisible"', '"inherited"'),
-    "color3f[] primvars:displayColor": ("[(1, 0, 0)]", "[(0, 0, 1)]"),
-    "uniform int2 resolution": ("(20, 10)", "(10, 20)"),
-    "float inputs:roughness": ("0.3", "0.6"),
+    "Camera": {
+        "double3 xformOp:translate": ((0, 0, 10), (0, 0, 20)),
+        "float focalLength": (70, 50),
+        "token projection": ('"orthographic"', '"perspective"'),
+    },
+    "SphereLight": {"float inputs:intensity": (3, 1), "float inputs:radius": (2, 0.5)},
+    "Cube": {"double size": (1, 2), "color3f[] primvars:displayColor": ([(1, 0, 0)], [(0, 0, 1)])},
+    "Sphere": {"token visibility": ('"invisible"', '"inherited"')},
+    "RenderSettings": {"uniform int2 resolution": ((20, 10), (10, 20))},
+    "Material": {"color3f inputs:diffuseColor": ((1, 0, 0), (0, 1, 0)), "float inputs:roughness": (0.3, 0.6)},
+    "GeomSubset": {"int[] indices": ([0], [1])},
+    "Mesh": {
+        "point3f[] points": (SHEET, [(x + 1, y + 1, z + 1) for x, y, z in SHEET]),
+        "int[] faceVertexCounts": ([4, 4], []),
+        "int[] faceVertexIndices": ([0, 1, 4, 3, 1, 2, 5, 4], [1, 4, 3, 0, 1, 2, 5, 4]),
+        "uniform token orientation": ('"leftHanded"', '"rightHanded"'),
+        "uniform token subdivisionScheme": ('"catmullClark"', '"none"'),
+        "token interpolateBoundary": ('"edgeOnly"', '"none"'),
+        "token faceVaryingLinearInterpolation": ('"all"', '"none"'),
+        "token triangleSubdivisionRule": ('"smooth"', '"catmullClark"'),
+        "int[] creaseIndices": ([1, 4], []),
+        "int[] creaseLengths": ([2], []),
+        "float[] creaseSharpnesses": ([2.5], []),
+        "int[] cornerIndices": ([5], []),
+        "float[] cornerSharpnesses": ([3], []),
+        "int[] holeIndices": ([1], []),
+        "texCoord2f[] primvars:st": (ST, ST[:1] * 3),
+        "int[] primvars:st:indices": ([0, 1, 2, 0, 1, 2, 0, 1], [0] * 8),
+        "float[] primvars:weight": ([0, 1, 2, 3, 4, 5], [0] * 6),
+    },
 }
 
 
-def test_values_of_all_prims_are_the_default_or_else_the_first_sample(stage):
-    def line(kind, name):
-        value, other = VALUES[name]
-        samples = f"{name}.timeSamples = {{ 1: {value if kind == 'samples' else other}, 2: {other} }}\n"
-        return ("" if kind == "samples" else f"{name} = {value}\n") + ("" if kind == "default" else samples)
+def values_of(kind, stored, sampled):
+    """Statements of the attributes of a kind of prim, of which some have samples in place of defaults, or both."""
+    for name, (value, other) in VALUES[kind].items():
+        interpolation = {"primvars:st": "faceVarying", "primvars:weight": "vertex"}.get(name.split()[1])
+        yield f'{name} (interpolation = "{interpolation}")' if interpolation else ""
+        yield "" if name in sampled and stored == "samples" else f"{name} = {value}"
+        samples = f"1: {value if stored == 'samples' else other}, 2: {other}"
+        yield f"{name}.timeSamples = {{ {samples} }}" if name in sampled else ""
 
-    def contents(kind):
-        def lines(*names):
-            return "".join(line(kind, name) for name in names)
 
-        order = 'uniform token[] xformOpOrder = ["xformOp:translate"]'
-        part = subset("[2]").replace("int[] indices = [2]\n", lines("int[] indices"))
-        text = (
-            prim("Camera", "camera", lines("double3 xformOp:translate", "float focalLength", "token projection"), order)
-            + prim("SphereLight", "lamp", lines("float inputs:intensity", "float inputs:radius"))
-            + prim("Cube", "cube", lines("double size", "color3f[] primvars:displayColor"))
-            + prim("Cube", "unseen", lines("token visibility"))
-            + prim("RenderSettings", "settings", lines("uniform int2 resolution"))
-            + material(lines("color3f inputs:diffuseColor", "float inputs:roughness"))
-            + mesh("parts", CUBE, part)
-        )
-        return StageReader(stage(text, head=NAMED)).at()
+def test_every_value_of_a_prim_is_its_default_or_else_its_first_sample(stage):
+    """For all attributes at once, and for each one of a mesh alone."""
 
-    plain, *others = map(contents, ("default", "samples", "both"))
-    assert {shape.name for shape in plain.shapes} == {"/cube", "/parts"}
+    def contents(stored):
+        of = {kind: "\n".join(values_of(kind, stored, attributes)) for kind, attributes in VALUES.items()}
+        of["Camera"] += '\nuniform token[] xformOpOrder = ["xformOp:translate"]'
+        of["Mesh"] += "\n" + subset("[0]").replace("int[] indices = [0]", of.pop("GeomSubset"))
+        text = material(of.pop("Material")) + mesh("sheet", of.pop("Mesh"))
+        text += "".join(prim(kind, kind.lower(), lines) for kind, lines in of.items())
+        return StageReader(stage(text, head='renderSettingsPrimPath = "/rendersettings"')).at()
+
+    def cage(stored, sampled):
+        return msub.ControlCage.from_file(stage(mesh("sheet", *values_of("Mesh", stored, sampled)))).contents
+
+    plain, alone = contents("default"), cage("default", [])
+    assert {shape.name for shape in plain.shapes} == {"/cube", "/sheet"}
     assert (plain.camera.focal_length, plain.lights[0].size, plain.resolution) == (70, [2], [20, 10])
-    assert all(same(plain, other) for other in others)
+    assert [len(tags) for tags in (alone.creases, alone.corners, alone.holes)] == [1, 1, 1]
+    for stored in ("samples", "both"):
+        assert same(contents(stored), plain)
+        for sampled in (*([name] for name in VALUES["Mesh"]), VALUES["Mesh"]):
+            assert same(cage(stored, sampled), alone), (stored, sampled)
 
 
 def test_a_layer_without_a_rate_of_times_is_read(stage, tmp_path):
@@ -298,33 +329,6 @@ def test_instances_have_velocities(scene, time, expected):
     loaded = mi.load_dict(scene(instancer(positions, mesh("cube", CUBE), velocities), time=time))
     (box,) = (shape.bbox() for shape in loaded.shapes() if shape.id() == "points_0_cube")
     np.testing.assert_allclose(box.center().x, expected, atol=1e-5)
-
-
-CREASES = "int[] creaseIndices = [0, 1, 3]\nint[] creaseLengths = [3]\nfloat[] creaseSharpnesses = [2.5]\n"
-TAGS = f"{CREASES}int[] cornerIndices = [7]\nfloat[] cornerSharpnesses = [10]\nint[] holeIndices = [3]\n"
-CORNER_TEXCOORDS = f"""texCoord2f[] primvars:st = [{", ".join(["(0,0), (1,0), (1,1), (0,1)"] * 6)}] (
-    interpolation = "faceVarying" )\n"""
-VERTEX_DATA = f"""normal3f[] normals = [(0,0,1), (0,1,0), (1,0,0), (0,0,1), (0,1,0), (1,0,0), (0,0,1), (1,0,0)]
-    texCoord2f[] primvars:st = [(0,0), (1,0), (1,1), (0,1), (0,0), (1,0), (1,1), (0,1)] ( interpolation = "vertex" )
-    {POLYGONS}"""
-
-
-def test_copies_in_place_of_many_instances_look_like_them(scene, monkeypatch, variant_llvm_ad_rgb):  # noqa: ARG001
-    """Mirrored ones, with creases, holes and texture coordinates, of limit surfaces and of polygons."""
-    content = mesh("smooth", CUBE, TAGS, CORNER_TEXCOORDS) + mesh("flat", CUBE.replace("-1", "-2"), VERTEX_DATA)
-    scales = "float3[] scales = [(0.3, 0.3, 0.3), (-0.3, 0.3, 0.3)]"
-    text = CAMERA + SUN + instancer([(-0.5, 0.2, 0), (0.5, -0.3, 0.4)], content, scales)
-    uv_and_normal = {"type": "aov", "aovs": "uv:uv,n:sh_normal", "img": {"type": "direct"}}
-    pictures, names = [], []
-    for least in (3, 2):
-        monkeypatch.setattr("mitsuba_usd.copies.LEAST_INSTANCES", least)
-        entries = {**scene(text, size=(32, 32)), "integrator": uv_and_normal}
-        names.append(set(entries) & {"points_0", "points_1", "copies_0_smooth", "copies_0_flat"})
-        pictures.append(np.array(mi.render(mi.load_dict(entries), spp=4)))
-    assert names == [{"points_0", "points_1"}, {"copies_0_smooth", "copies_0_flat"}]
-    assert np.ptp(pictures[0][..., 3:5], axis=(0, 1)).min() > 0.2
-    # Rays meet instances in their own space, which rounds otherwise.
-    assert np.mean(np.abs(pictures[0] - pictures[1]) > 1e-3) < 0.01
 
 
 @pytest.mark.parametrize(("most_faces", "rounding"), [(stage_meshes.MOST_SHARED_FACES, 0), (0, 1e-6)])
