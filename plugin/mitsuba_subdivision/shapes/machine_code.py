@@ -32,8 +32,8 @@ _NANOBIND = {
     "set_state": "_ZN8nanobind6detail17nb_inst_set_stateEP7_objectbb",
     "destruct": "_ZN8nanobind6detail16nb_inst_destructEP7_object",
 }
-# The C++ instance of a Python object, and the size of a C++ type in bytes
-_POINTER_OF, _SIZE_OF = "_ZN8nanobind6detail11nb_inst_ptrEP7_object", "_ZN8nanobind6detail12nb_type_sizeEP7_object"
+# The C++ instance of a Python object
+_POINTER_OF = "_ZN8nanobind6detail11nb_inst_ptrEP7_object"
 # Lowest bit of an address that differs between C++ objects, which are aligned to 16 bytes; used by `tag_of`.
 _LOWEST_BIT = 4
 # Upper bound of the size of the exception, in bytes.
@@ -57,7 +57,7 @@ f30f1efa 55 4889e5 53 4154 4881ece0000000 ; endbr64; push rbp; mov rbp, rsp; pus
 48897de8 488975e0 488955d8 48894dd0 4c8945c8 4c894dc0 ; mov [rbp - 0x18], rdi; ...; mov [rbp - 0x40], r9
 """
 _LEAVE = """
-leave: 488b45e8 488d65f0 415c 5b 5d c3 ; mov rax, [rbp - 0x18]; lea rsp, [rbp - 0x10]; pop r12; pop rbx; pop rbp; ret
+488b45e8 488d65f0 415c 5b 5d c3 ; mov rax, [rbp - 0x18]; lea rsp, [rbp - 0x10]; pop r12; pop rbx; pop rbp; ret
 """
 # Unblocks signals: C++ runs again.
 _RELEASE = """
@@ -71,7 +71,7 @@ call PyGILState_Ensure 89c3 ; mov ebx, eax
 rdi function rsi numbers 488b55e8 488b4de0 4c8b45d8 4c8b4dd0 ; mov rdx, [rbp - 0x18]; ...; mov r9, [rbp - 0x30]
 4883ec08 ff7510 ff75c0 ff75c8 ; sub rsp, 8; push [rbp + 0x10]; push [rbp - 0x40]; push [rbp - 0x38]
 31c0 call PyObject_CallFunction 4883c420 ; xor eax, eax; add rsp, 32
-4885c0 je failed 4889c7 call Py_DecRef ; test rax, rax; mov rdi, rax
+4885c0 je 4889c7 call Py_DecRef ; test rax, rax; mov rdi, rax
 {_RELEASE}
 """
 # Throws the error that Python has raised as a C++ exception: its type, value and traceback are at rbp - 0xd8 and below.
@@ -85,16 +85,16 @@ rdi error_size call __cxa_allocate_exception 4989c4 4889c7 call error ; mov r12,
 {_RELEASE}
 4c89e7 rsi error_type rdx no_error call __cxa_throw 0f0b ; mov rdi, r12; ud2
 """
+_CALL_ORIGINAL = "4883ec08 ff7510 call original 4883c410 ; sub rsp, 8; push [rbp + 0x10]; add rsp, 16"
 # The original function before Python. After an exception, its result does not exist for C++: it is destructed without
 # freeing its memory.
-_CALL_ORIGINAL = "4883ec08 ff7510 call original 4883c410 ; sub rsp, 8; push [rbp + 0x10]; add rsp, 16"
-_SKIP_EQUAL = """
-488b45e8 488b88 +first 483b88 +second je leave ; mov rax, [rbp - 0x18]; mov rcx, [rax + first]; cmp rcx, [rax + second]
-"""
-_DESTRUCT_RESULT = """
+_AFTER = f"""
+{_ENTER} {_CALL_ORIGINAL}
+{_CALL_PYTHON} {_LEAVE}
 failed: rdi kind 488b75e8 rdx 0 call object_at 48898528ffffff ; mov rsi, [rbp - 0x18]; mov [rbp - 0xd8], rax
 488bbd28ffffff rsi 1 rdx 1 call set_state 488bbd28ffffff call destruct ; mov rdi, [rbp - 0xd8]
 488bbd28ffffff rsi 0 rdx 0 call set_state 488bbd28ffffff call Py_DecRef
+{_RAISE}
 """
 # Python before the original function. Adds `tag_of` the second argument to the fifth.
 _BEFORE = f"""
@@ -122,7 +122,6 @@ def bindings() -> ctypes.PyDLL:
     for name, result, arguments in (
         (_POINTER_OF, address, [ctypes.py_object]),
         (_NANOBIND["object_at"], ctypes.py_object, [ctypes.py_object, address, address]),
-        (_SIZE_OF, ctypes.c_size_t, [ctypes.py_object]),
         ("__cxa_demangle", address, [ctypes.c_char_p, *[address] * 3]),
     ):
         function = getattr(library, name)
@@ -143,15 +142,6 @@ def address_of(instance: object) -> int:
 def object_at(kind: type, address: int) -> Any:
     """Python object of a type for the C++ instance at an address."""
     return getattr(bindings(), _NANOBIND["object_at"])(kind, address, None)
-
-
-def offsets(structure: Any, *names: str) -> tuple[int, ...]:
-    """Offsets of members in a C++ structure. Raises RuntimeError if a member is elsewhere."""
-    address, size = address_of(structure), getattr(bindings(), _SIZE_OF)(type(structure))
-    distances = tuple(address_of(getattr(structure, name)) - address for name in names)
-    if not all(0 <= distance < size for distance in distances):
-        raise RuntimeError(f"{names} of {type(structure).__name__} are not where it is")
-    return distances
 
 
 def name_at(address: int) -> str:
@@ -214,15 +204,13 @@ def calling_after(
     kind: type,  # Python type of the object
     # Called with the object's address and the six arguments. The upper bits of smaller arguments are arbitrary.
     function: Callable[..., None],
-    # (2,) tuple of int: offsets of two words of the object. If the words are equal, Python is not called.
-    equal: tuple[int, ...] | None = None,
 ) -> int:
     """Make a virtual function that calls the original function, and then Python. Returns its address.
 
     Raises OSError if the system allows no executable memory. Raises AttributeError if the libraries lack a required
     function.
     """
-    return _installed(_code_after(original, kind, function, equal), kind, function)
+    return _installed(_assembled(_AFTER, original=original, kind=id(kind), function=id(function)), kind, function)
 
 
 def calling_before(
@@ -247,7 +235,7 @@ def require_trampolines() -> None:
     Raises OSError if the system does not allow memory that was written to be executed. Raises AttributeError if the
     libraries lack a required function.
     """
-    _code_after(0, object, print, None)
+    _assembled(_AFTER, original=0, kind=0, function=0)
     _protect(_writable_page(), mmap.PROT_READ | mmap.PROT_EXEC)
 
 
@@ -287,20 +275,11 @@ def _protect(page: int, allowed: int) -> None:
         raise OSError(ctypes.get_errno(), "memory cannot be made executable, or a table writable")
 
 
-def _code_after(original: int, kind: type, function: Callable[..., None], equal: tuple[int, ...] | None) -> bytes:
-    """Machine code of `calling_after`."""
-    first, second = equal or (0, 0)
-    parts = _ENTER, _CALL_ORIGINAL, _SKIP_EQUAL if equal else "", _CALL_PYTHON, _LEAVE, _DESTRUCT_RESULT, _RAISE
-    values = {"original": original, "kind": id(kind), "function": id(function), "first": first, "second": second}
-    return _assembled("\n".join(parts), **values)
-
-
 def _assembled(text: str, **values: int) -> bytes:
     """Machine code of a text of hexadecimal digits and of words.
 
-    - ``NAME:`` is where ``je NAME`` jumps if the last comparison found equality.
+    - ``failed:``, further on, is where ``je`` jumps if the last comparison found equality.
     - A register and a value: ``mov register, value``. ``call`` and a value: ``mov r11, value; call r11``.
-    - ``+NAME`` is a value of 32 bits.
 
     Values are numbers, names in ``values``, and functions of Python and of the libraries.
     """
@@ -315,22 +294,20 @@ def _assembled(text: str, **values: int) -> bytes:
             values[name] = ctypes.cast(library[_NANOBIND.get(name, name)], ctypes.c_void_p).value or 0
         return struct.pack("<Q", values[name])
 
-    code, places, jumps = bytearray(), {}, []
+    code, jump = bytearray(), 0
     words = (word for line in text.splitlines() for word in line.partition(";")[0].split())
     for word in words:
-        if word.endswith(":"):
-            places[word[:-1]] = len(code)
+        if word == "failed:":
+            code[jump - 4 : jump] = struct.pack("<i", len(code) - jump)
         elif word == "je":
             code += bytes.fromhex("0f84") + bytes(4)
-            jumps.append((len(code), next(words)))
+            jump = len(code)
         elif word == "call":
             code += bytes.fromhex(_MOVES["r11"]) + value(next(words)) + bytes.fromhex("41ffd3")
         elif word in _MOVES:
             code += bytes.fromhex(_MOVES[word]) + value(next(words))
         else:
-            code += struct.pack("<i", values[word[1:]]) if word.startswith("+") else bytes.fromhex(word)
-    for end, name in jumps:
-        code[end - 4 : end] = struct.pack("<i", places[name] - end)
+            code += bytes.fromhex(word)
     return bytes(code)
 
 
