@@ -1,6 +1,5 @@
 """Hits of lines: on them and on the surface, from nearby and far away, at borders and next to extraordinary points."""
 
-import drjit as dr
 import numpy as np
 import pytest
 from kernels.surfaces import aimed, computed, hit, kernel_named, random_locations, surface_named, vectors
@@ -8,9 +7,7 @@ from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels import line_intersection
-from mitsuba_subdivision.kernels.algebra import STEP_TOLERANCE
-from mitsuba_subdivision.kernels.line_intersection import ON_LINE, ON_NORMAL, piece_hits
-from mitsuba_subdivision.kernels.piece_kernel import PieceKernel
+from mitsuba_subdivision.kernels.line_intersection import ON_LINE, ON_NORMAL
 from patches.closed_cages import bumpy, extraordinary_triangles
 
 pytestmark = pytest.mark.usefixtures("llvm")
@@ -162,41 +159,3 @@ def test_locations_are_where_the_points_lie_however_few_rounds_there_are(monkeyp
     assert are_hit.any()
     again = vectors(kernel.at(location).p)
     np.testing.assert_allclose(again[are_hit], vectors(values.value)[are_hit], rtol=0, atol=ON_RAY[DOUBLE])
-
-
-def first_hits(o, d, corners):
-    """``(n,)`` ray parameters of the nearest of some triangles ``(m, 3, 3)``; infinite where there is none."""
-    a, e, f = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    across, away = np.cross(d[:, None], f), o[:, None] - a
-    inverse = 1 / (across * e).sum(axis=2)
-    turned = np.cross(away, e)
-    b1, b2 = (across * away).sum(axis=2) * inverse, (turned * d[:, None]).sum(axis=2) * inverse
-    t = (turned * f).sum(axis=2) * inverse
-    return np.where((b1 >= 0) & (b2 >= 0) & (b1 + b2 <= 1) & (t > 0), t, np.inf).min(axis=1)
-
-
-@pytest.mark.parametrize("name", ["torus", "cube", "loop mixed torus"])
-def test_the_nearest_of_the_hits_on_all_pieces_is_that_on_a_fine_tessellation(name, np_rng):
-    """From some places on each piece, whatever the ray: only hits inside of the piece count."""
-    surface, kernel = surface_named(name), kernel_named(name, DOUBLE)
-    types, patches = kernel.types, PieceKernel(surface.pieces(), kernel.types.float)
-    o = np_rng.normal(size=(50, 3))
-    o *= 6 / np.linalg.norm(o, axis=1)[:, None]
-    d = surface.sample(50, 3).p + 0.2 * np_rng.normal(size=(50, 3)) - o
-    element, uv, corner = (np.concatenate([values] * 50) for values in random_locations(surface, np_rng, 4000, 3))
-    start = kernel.walk.at(types.indices(element), *map(types.floats, uv.T), types.indices(corner))
-    piece = patches.piece(kernel.coefficients, start.half_edge, start.u, start.v)
-    rays = (upload(types.vector3, np.repeat(values, 4000, axis=0)) for values in (o, d))
-    _, step, length, _, values = piece_hits(types, piece, *rays, steps=12)
-    met = (length * piece.magnification < STEP_TOLERANCE) & piece.is_inside(*step, 1e-6)
-    dr.eval(met, values.value)
-    along = ((vectors(values.value).reshape(50, 4000, 3) - o[:, None]) * d[:, None]).sum(axis=2)
-    t = np.where(np.array(met).reshape(50, 4000), along / (d**2).sum(axis=1)[:, None], np.inf).min(axis=1)
-    mesh = surface.tessellate(12)
-    expected = first_hits(o, d, mesh.positions[mesh.triangles])
-    is_hit = np.isfinite(expected)
-    assert 0.5 < is_hit.mean() < 1
-    # Beside outlines, triangles are missed or met that are not the surface.
-    assert (np.isfinite(t) == is_hit).mean() >= 0.97
-    both = is_hit & np.isfinite(t)
-    assert (np.abs(t[both] - expected[both]) < 3e-3).mean() >= 0.97

@@ -11,13 +11,10 @@ import numpy as np
 import pytest
 from kernels.surfaces import (
     SURFACES,
-    aimed,
     computed,
-    hit,
     kernel_named,
     on_device,
     random_locations,
-    rays_of,
     surface_named,
     vectors,
 )
@@ -206,7 +203,7 @@ def test_stams_form_is_the_same_but_for_rounding_which_takes_its_normals_in_sing
     assert lost["stabilized"].max() < 1e-6
 
 
-# Derivatives by control points and parameters
+# Derivatives
 
 # Of few control points each, as the kernels for derivatives by these take long to compile.
 SMALL = {
@@ -216,119 +213,94 @@ SMALL = {
     "triangles": ("loop", tetrahedron()),
     "doo_sabin": ("doo_sabin", tetrahedron()),
 }
+# And order of derivatives. Hits and nearest points from where they are: then nothing but rounding is left after more
+# steps.
+DIFFERENTIATED = [
+    *(("evaluate", name, 2) for name in ("polygons", "triangles", "doo_sabin")),
+    *(("evaluate", name, 1) for name in ("control points of its own", "border")),
+    *(("intersect", *case) for case in (("polygons", 2), ("triangles", 2), ("border", 1))),
+    *(("closest", name, 1) for name in ("control points of its own", "sheet", "half disc of 6", "loop sheet")),
+]
 
 
 def small_surface(name):
-    scheme, cage = SMALL[name]
-    return LimitSurface(bumpy(cage), scheme)
+    return LimitSurface(bumpy(SMALL[name][1]), SMALL[name][0]) if name in SMALL else surface_named(name)
 
 
-def forward(outputs, inputs, changes):
-    """Changes of outputs, from those of inputs."""
-    for value, change in zip(inputs, changes, strict=True):
-        dr.set_grad(value, change)
+@pytest.mark.parametrize(("kind", "name", "order"), DIFFERENTIATED)
+def test_derivatives_are_differences_and_the_same_both_ways(kind, name, order, np_rng):
+    """By control points, and by parameters, rays or points: hits stay on their rays, and nearest points near."""
+    surface = small_surface(name)
+    kernel, count = surface.on_device(DOUBLE), 80
+    types = kernel.types
+    element, uv, corner = random_locations(surface, np_rng, count, deepest=6 if kind == "evaluate" else 4)
+    # Away from lines between pieces, across which third derivatives jump, and from extraordinary points, beside which
+    # hits leave second derivatives out.
+    is_middle = np.arange(count) < count / 2
+    uv[is_middle] = 0.3 + 0.1 * np.abs(uv - np.round(uv))[is_middle]
+    s, others = surface.evaluate(element, uv, corner), [uv]
+    if kind == "intersect":
+        d = s.n + np_rng.uniform(-0.3, 0.3, s.n.shape)
+        others = [s.p - d, d]
+    elif kind == "closest":
+        size = np.ptp(s.p, axis=0).max()
+        beyond = 0.3 * size * np_rng.normal(size=s.p.shape) * ~is_middle[:, None]
+        others = [s.p + 0.1 * size * np_rng.normal(size=(count, 1)) * s.n + beyond]
+        nearest = surface.closest_point(others[0])
+        element, uv, corner = nearest.element, nearest.uv, nearest.corner
+    place, values = on_device(types, element, uv, corner), [surface.cage.positions, *others]
+    ways = [np_rng.normal(size=value.shape) for value in values]
+
+    tangents, curvature = {"dp_du", "dp_dv"}, {"dn_du", "dn_dv"} if order == 2 else set()
+    more = {"evaluate": [*tangents, *curvature], "intersect": ["t", *tangents, *curvature], "closest": ["distance"]}
+    names = ["p", "n", *sorted(more[kind])]
+    only_in_middle = curvature | (tangents if kind == "intersect" else set())
+
+    def outputs_of(points, *others):
+        kernel.set_control_points(points)
+        if kind == "evaluate":
+            s = kernel.evaluate(place[0], *others, place[2], derivatives=order)
+        elif kind == "intersect":
+            s = kernel.intersect(SimpleNamespace(o=others[0], d=others[1]), *place, derivatives=order)
+        else:
+            s = kernel.closest(*others, *place)
+        return [getattr(s, name) for name in names]
+
+    def moved(step):
+        at = (upload(vector, value + step * way) for vector, value, way in zip(vectors_of, values, ways, strict=True))
+        return [np.array(output).T for output in computed(outputs_of(*at))]
+
+    vectors_of = [types.vector2 if value.shape[1] == 2 else types.vector3 for value in values]
+    differences = [(a - b) / (2 * STEP) for a, b in zip(moved(STEP), moved(-STEP), strict=True)]
+    inputs = [upload(vector, value) for vector, value in zip(vectors_of, values, strict=True)]
+    changes = [upload(vector, way) for vector, way in zip(vectors_of, ways, strict=True)]
+    dr.enable_grad(inputs)
+    outputs = outputs_of(*inputs)
+    dr.set_grad(inputs, changes)
     dr.enqueue(dr.ADMode.Forward, *inputs)
     dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearNone)
-    return [np.array(gradient).T for gradient in computed([dr.grad(output) for output in outputs])]
+    forward = [np.array(gradient).T for gradient in computed(dr.grad(outputs))]
+    is_hit = np.full(count, True) if kind != "intersect" else np.isfinite(np.array(outputs[names.index("t")]))
+    assert is_hit.mean() > 0.95
+    for field, derivative, difference in zip(names, forward, differences, strict=True):
+        kept = is_hit & is_middle if field in only_in_middle else is_hit
+        largest = np.abs(difference[kept]).max()
+        assert largest > 0.1
+        rtol, atol = (STEEP, HIT_DIFFERENCES) if kind == "intersect" else (DIFFERENCES, DIFFERENCES)
+        atol = (THIRD if field in curvature else atol) * max(1, largest)
+        np.testing.assert_allclose(derivative[kept], difference[kept], rtol, atol, err_msg=field)
 
-
-def assert_differentiated(outputs_of, inputs, changes, differences, rng, kept=..., rtol=0, atol=DIFFERENCES):
-    """Derivatives are these differences, and those of reverse mode are of the same linear map."""
-    dr.enable_grad(inputs)
-    forwards = forward(outputs_of(), inputs, changes)
-    for one, other in zip(forwards, differences, strict=True):
-        assert np.abs(one).max() > 0.1
-        scale = max(1, np.abs(other[kept]).max())
-        np.testing.assert_allclose(one[kept], other[kept], rtol=rtol, atol=atol * scale)
-    seeds = [rng.normal(size=derivative.shape) for derivative in forwards]
+    seeds = [np_rng.normal(size=derivative.shape) for derivative in forward]
     dr.clear_grad(inputs)
-    outputs = outputs_of()
+    outputs = outputs_of(*inputs)
     for output, seed in zip(outputs, seeds, strict=True):
         dr.set_grad(output, upload(type(output), seed))
     dr.enqueue(dr.ADMode.Backward, *outputs)
     dr.traverse(dr.ADMode.Backward)
-    gradients = computed([dr.grad(value) for value in inputs])
-    products = np.concatenate([(f * s).ravel() for f, s in zip(forwards, seeds, strict=True)])
-    product = sum((np.array(c) * np.array(g)).sum() for c, g in zip(changes, gradients, strict=True))
+    gradients = computed(dr.grad(inputs))
+    products = np.concatenate([(f * s).ravel() for f, s in zip(forward, seeds, strict=True)])
+    product = sum((way * np.array(gradient).T).sum() for way, gradient in zip(ways, gradients, strict=True))
     assert abs(product - products.sum()) <= BARS[DOUBLE]["point"] * np.abs(products).sum()
-
-
-@pytest.mark.parametrize("by", ["points", "parameters", "rays"])
-def test_derivatives_of_derivatives_of_normals_are_differences(by, np_rng):
-    """Those by parameters, which also follow rays, are differences over a thousandth of a piece themselves."""
-    surface = small_surface("polygons")
-    kernel = surface.on_device(DOUBLE)
-    types, positions = kernel.types, surface.cage.positions
-    element, uv, corner = random_locations(surface, np_rng, 40, deepest=3)
-    # Away from lines between pieces, across which third derivatives jump.
-    uv = 0.3 + 0.1 * np.abs(uv - np.round(uv))
-    s = surface.evaluate(element, uv, corner)
-    o, d = s.p - s.n, s.n + np_rng.uniform(-0.3, 0.3, s.n.shape)
-    values = {"points": positions, "parameters": uv, "rays": o}
-    direction = types.floats(np_rng.normal(size=values[by].size))
-
-    def samples_at(step):
-        flat = {name: types.floats(value.ravel()) for name, value in values.items()}
-        flat[by] = flat[by] + step * direction
-        p, w, origin = flat.values()
-        kernel.set_control_points(p)
-        place = types.indices(element), dr.unravel(types.vector2, w), types.indices(corner)
-        if by != "rays":
-            return kernel.evaluate(*place, derivatives=2)
-        ray = SimpleNamespace(o=dr.unravel(types.vector3, origin), d=upload(types.vector3, d))
-        return kernel.intersect(ray, *place, derivatives=2)
-
-    step = types.floats(0)
-    dr.enable_grad(step)
-    at = samples_at(step)
-    (change,) = forward([at.dn_du + 2 * at.dn_dv], [step], [types.floats(1)])
-    ends = [
-        vectors(end.dn_du + 2 * end.dn_dv) for end in (samples_at(types.floats(STEP)), samples_at(types.floats(-STEP)))
-    ]
-    difference = (ends[0] - ends[1]) / (2 * STEP)
-    assert np.abs(difference).max() > 0.1
-    np.testing.assert_allclose(change, difference, rtol=0, atol=THIRD * np.abs(difference).max())
-
-
-@pytest.mark.parametrize("name", SMALL)
-def test_derivatives_by_control_points_are_differences_and_the_same_both_ways(name, np_rng):
-    surface = small_surface(name)
-    kernel = surface.on_device(DOUBLE)
-    locations = random_locations(surface, np_rng, 60, deepest=10)
-    positions, direction = surface.cage.positions, np_rng.normal(size=surface.cage.positions.shape)
-
-    def moved(step):
-        s = LimitSurface(surface.cage.with_positions(positions + step * direction), surface.scheme).evaluate(*locations)
-        return s.p, s.n, s.dp_du
-
-    differences = [(a - b) / (2 * STEP) for a, b in zip(moved(STEP), moved(-STEP), strict=True)]
-    points = kernel.types.floats(positions.ravel())
-
-    def outputs():
-        kernel.set_control_points(points)
-        samples = kernel.evaluate(*on_device(kernel.types, *locations))
-        return samples.p, samples.n, samples.dp_du
-
-    assert_differentiated(outputs, [points], [kernel.types.floats(direction.ravel())], differences, np_rng)
-
-
-@pytest.mark.parametrize("name", ["polygons", "triangles"])
-def test_derivatives_by_parameters_are_tangents_and_those_of_tangents_and_normals(name, np_rng):
-    """At the deeper levels of tips, too, where those by hits leave second derivatives out."""
-    surface = small_surface(name)
-    kernel = surface.on_device(DOUBLE)
-    location = random_locations(surface, np_rng, 200, deepest=6)
-    element, uv, corner = on_device(kernel.types, *location)
-    expected = surface.evaluate(*location, derivatives=2)
-    for axis, second in enumerate(((expected.d2p_duu, expected.d2p_duv), (expected.d2p_duv, expected.d2p_dvv))):
-        own = kernel.types.vector2(uv)
-        dr.enable_grad(own)
-        one, two = (kernel.evaluate(element, own, corner, derivatives=order) for order in (1, 2))
-        changes = forward([two.p, two.n, one.dp_du, one.dp_dv], [own], [kernel.types.vector2(1 - axis, axis)])
-        first = (two.dp_du, two.dn_du) if axis == 0 else (two.dp_dv, two.dn_dv)
-        for change, derivative in zip(changes, (*map(vectors, first), *second), strict=True):
-            scale = np.linalg.norm(derivative, axis=1).max()
-            np.testing.assert_allclose(change, derivative, rtol=0, atol=BARS[DOUBLE]["derivative"] * scale)
 
 
 def test_placed_normals_turn_as_the_placed_surface_does(np_rng):
@@ -346,41 +318,6 @@ def test_placed_normals_turn_as_the_placed_surface_does(np_rng):
         ahead, behind = (vectors(at(0.3 + side * du, 0.2 + side * dv).n) for side in (1, -1))
         difference = (ahead - behind) / (2 * step)
         np.testing.assert_allclose(vectors(turn), difference, rtol=0, atol=1e-8 * np.abs(difference).max())
-
-
-@pytest.mark.parametrize("name", ["polygons", "border", "triangles"])
-def test_derivatives_of_hits_are_differences_and_the_same_both_ways(name, np_rng):
-    """By control points, and by the rays' origins and directions: points stay on their rays."""
-    surface = small_surface(name)
-    kernel = surface.on_device(DOUBLE)
-    types, vector3 = kernel.types, kernel.types.vector3
-    _, o, d, start = aimed(surface, np_rng, 80, near=0.02)
-    # From where they meet the surface: then nothing but rounding is left after three more steps.
-    at = hit(kernel, o, d, *start).location
-    half_edge, first = np.array(at.half_edge), surface.patches.elements.face_offsets
-    element = np.searchsorted(first, half_edge, side="right") - 1
-    locations = on_device(types, element, np.array([at.u, at.v]).T, half_edge - first[element])
-    values = surface.cage.positions, o, d
-    directions = [np_rng.normal(size=value.shape) for value in values]
-
-    def met(step):
-        points, *ray = (value + step * direction for value, direction in zip(values, directions, strict=True))
-        kernel.set_control_points(types.floats(points.ravel()))
-        hits = computed(kernel.intersect(rays_of(types, *ray), *locations))
-        return vectors(hits.p), vectors(hits.n), np.array(hits.t)
-
-    differences = [(a - b) / (2 * STEP) for a, b in zip(met(STEP), met(-STEP), strict=True)]
-    is_hit = np.isfinite(met(0)[2])
-    assert is_hit.mean() > 0.95
-    inputs = [types.floats(values[0].ravel()), upload(vector3, o), upload(vector3, d)]
-
-    def outputs():
-        kernel.set_control_points(inputs[0])
-        hits = kernel.intersect(SimpleNamespace(o=inputs[1], d=inputs[2]), *locations)
-        return hits.p, hits.n, hits.t
-
-    changes = [types.floats(directions[0].ravel()), *(upload(vector3, direction) for direction in directions[1:])]
-    assert_differentiated(outputs, inputs, changes, differences, np_rng, is_hit, STEEP, HIT_DIFFERENCES)
 
 
 # What can be wrong
