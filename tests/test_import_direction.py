@@ -117,15 +117,18 @@ def test_modules_do_not_import_in_circles(graph, root):
 def test_whole_usd_files_are_built_on_public_names():
     wrong = []
     for path in WHOLE_FILES.rglob("*.py"):
+        names, packages = [], {}
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.ImportFrom) and not node.level:
-                wrong += [
-                    (path.name, node.module, alias.name)
-                    for alias in node.names
-                    if not is_public(node.module, alias.name)
-                ]
+                names += [(node.module, alias.name) for alias in node.names]
             elif isinstance(node, ast.Import):
-                wrong += [(path.name, alias.name) for alias in node.names if not is_public(alias.name)]
+                names += [(alias.name, None) for alias in node.names]
+            elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                packages.setdefault(node.value.id, set()).add(node.attr)
+        for name in [name for module, name in names if module == PACKAGE and (ROOT / name).is_dir()]:
+            names.remove((PACKAGE, name))
+            names += [(f"{PACKAGE}.{name}", attribute) for attribute in packages[name]]
+        wrong += [(path.name, *name) for name in names if not is_public(*name)]
     assert wrong == []
 
 

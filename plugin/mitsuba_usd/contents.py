@@ -150,13 +150,6 @@ class LightContents:
     texture: str | None = None  # Path of a picture that multiplies the radiance
     pole: str = "y"  # Axis of a dome's image
 
-    @property
-    def is_usable(self) -> bool:
-        """Whether its transform and size are finite and not degenerate."""
-        numbers = np.array([*self.emission, *self.size, *self.to_world.ravel()])
-        has_size = self.kind in ("distant", "dome", "point", "spot") or min(self.size) > 0
-        return bool(np.isfinite(numbers).all()) and np.linalg.det(self.to_world[:3, :3]) != 0 and has_size
-
 
 @dataclass(frozen=True, eq=False)
 class CameraContents:
@@ -177,14 +170,6 @@ class CameraContents:
     focus_distance: float
     shutter: list[float]  # When it opens and closes, in time codes after the time
     conform_policy: str = "expandAperture"  # For pictures of another aspect ratio; see `sensors.film_window`
-
-    @property
-    def is_usable(self) -> bool:
-        """Whether it has an image."""
-        numbers = np.array([*self.offset, self.near, self.far, self.lens_radius, self.focus_distance, *self.shutter])
-        lengths = np.array([*self.aperture, self.focal_length])
-        is_finite = all(np.isfinite(values).all() for values in (self.to_world, numbers, lengths))
-        return is_finite and bool((lengths > 0).all())
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,19 +8,11 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
+from mitsuba_subdivision import studio
 from mitsuba_subdivision.cage import CageContents, CageError, ControlCage
 from mitsuba_subdivision.mesh import IntArray, Topology
 from mitsuba_subdivision.mitsuba_mesh import box_corners, points_at
 from mitsuba_subdivision.schemes import SchemeError
-from mitsuba_subdivision.studio import (
-    MOST_SEGMENTS,
-    MOST_TRIANGLES,
-    highest_rate,
-    outline_for,
-    pixels_of_boxes,
-    segments_for,
-    triangles_for,
-)
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
@@ -40,8 +32,8 @@ def with_rate(parameters: dict[str, Any], contents: SceneContents) -> dict[str, 
         return parameters
     corners = sum(int(shape.cage.face_sizes.sum()) for shape in contents.all_shapes if shape.cage.scheme is not None)
     # A quadrilateral has four corners, and two triangles for each square of the rate.
-    most = math.sqrt(2 * MOST_TRIANGLES / max(corners, 1))
-    return {**parameters, "tessellation_rate": int(np.clip(most, 1, MOST_SEGMENTS))}
+    most = math.sqrt(2 * studio.MOST_TRIANGLES / max(corners, 1))
+    return {**parameters, "tessellation_rate": int(np.clip(most, 1, studio.MOST_SEGMENTS))}
 
 
 def is_chosen(parameters: dict[str, Any]) -> bool:
@@ -69,10 +61,10 @@ def triangles_for_picture(
     }
     if needed and parameters["shading"] == "exact" and follows_sensor and "displacement" not in parameters:
         corners = {shape: int(shape.cage.face_sizes.sum()) for shape in needed}
-        highest = highest_rate(np.array([*needed.values()]), np.array([*corners.values()]))
+        highest = studio.highest_rate(np.array([*needed.values()]), np.array([*corners.values()]))
         for shape in contents.shapes:
             if shape in needed:
-                chosen[shape] = triangles_for(needed[shape], corners[shape], most, outline, highest)
+                chosen[shape] = studio.triangles_for(needed[shape], corners[shape], most, outline, highest)
     return chosen
 
 
@@ -96,7 +88,7 @@ def segments_of(
     for cage, alike in of_cage.items():
         copies = np.concatenate([of_shape[shape] for shape in alike])
         counts = [len(of_shape[shape]) for shape in alike]
-        segments = np.split(segments_for(cage, copies, outline, near_clip, shading), np.cumsum(counts)[:-1])
+        segments = np.split(studio.segments_for(cage, copies, outline, near_clip, shading), np.cumsum(counts)[:-1])
         needed |= dict(zip(alike, segments, strict=True))
     return needed
 
@@ -106,7 +98,7 @@ def texels_for_pictures(contents: SceneContents, sensors: Sequence[SceneNode]) -
 
     Files of which the detail is unknown are missing, or have no bound.
     """
-    seen = [(outline_for(sensor), sensor["near_clip"]) for sensor in sensors]
+    seen = [(studio.outline_for(sensor), sensor["near_clip"]) for sensor in sensors]
     matrices: dict[ShapeContents, list[NDArray[np.float64]]] = {}
     for shape, to_world in contents.placed_shapes:
         if shape.material is not None:
@@ -149,7 +141,7 @@ def _pixels_of_texcoords(
         return np.inf
     box = np.stack([cage.positions.min(axis=0), cage.positions.max(axis=0)]).astype(np.float64)
     corners_of_copies = points_at(box_corners(box), to_world)
-    pixels = np.max([pixels_of_boxes(corners_of_copies, *view) for view in seen], axis=0)
+    pixels = np.max([studio.pixels_of_boxes(corners_of_copies, *view) for view in seen], axis=0)
     stretch = np.linalg.norm(to_world[:, :3, :3], 2, axis=(1, 2))
     ratio = float(np.quantile(lengths[there] / in_texture[there], _MOST_EDGES))
     return ratio * float((stretch * pixels).max())

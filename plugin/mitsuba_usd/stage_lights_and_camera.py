@@ -82,7 +82,7 @@ def read_light(
     pole = _value(prim, "poleAxis", time, "scene") if given == "DomeLight_1" else "Y"
     if pole == "scene":
         pole = UsdGeom.GetStageUpAxis(prim.GetStage())
-    return LightContents(
+    light = LightContents(
         str(path),
         kind,
         to_world,
@@ -92,6 +92,11 @@ def read_light(
         _texture(prim, time, notes) if kind in ("rect", "dome") else None,
         str(pole).lower(),
     )
+    numbers = np.array([*light.emission, *light.size, *to_world.ravel()])
+    is_area = light.kind not in ("distant", "dome", "point", "spot")
+    if not np.isfinite(numbers).all() or np.linalg.det(to_world[:3, :3]) == 0 or (is_area and min(light.size) <= 0):
+        raise ValueError("the light is not usable; expected finite numbers, a size above 0 and an invertible transform")
+    return light
 
 
 def read_emission(prim: Usd.Prim, time: Usd.TimeCode) -> NDArray[np.float64]:
@@ -185,7 +190,7 @@ def read_camera(
     time: Usd.TimeCode,
     notes: StageWarnings,
 ) -> CameraContents:
-    """Read a camera."""
+    """Read a camera. Raises TypeError, ValueError if it has no image."""
     x, y, z = to_world[:3, :3].T
     forward = -z / np.linalg.norm(z)
     up = y - forward * (forward @ y)
@@ -206,6 +211,7 @@ def read_camera(
     unit = 1.0 if is_perspective else _TENTHS
     aperture = [number(camera.GetHorizontalApertureAttr()), number(camera.GetVerticalApertureAttr())]
     offset = [number(camera.GetHorizontalApertureOffsetAttr()), number(camera.GetVerticalApertureOffsetAttr())]
+    shutter = [number(camera.GetShutterOpenAttr()), number(camera.GetShutterCloseAttr())]
     near, far = value_at(camera.GetClippingRangeAttr(), time)
     if not near <= far:
         notes.add("a clippingRange of cameras that is not from a number to a larger one is ignored", camera.GetPath())
@@ -221,6 +227,9 @@ def read_camera(
             notes.add(f"{name} of cameras is ignored; pictures have the radiance of the scene", camera.GetPath())
     if value_at(camera.GetClippingPlanesAttr(), time):
         notes.add("clippingPlanes of cameras are ignored", camera.GetPath())
+    numbers = [*to_world.ravel(), *aperture, *offset, focal_length, near, far, focus if has_lens else 0, *shutter]
+    if not np.isfinite(numbers).all() or min(*aperture, focal_length) <= 0:
+        raise ValueError("the camera has no image")
     return CameraContents(
         str(camera.GetPath()),
         rigid,
@@ -232,5 +241,5 @@ def read_camera(
         float(far),
         _TENTHS * focal_length / (2 * f_stop) if has_lens else 0.0,
         focus if has_lens else 0.0,
-        [number(camera.GetShutterOpenAttr()), number(camera.GetShutterCloseAttr())],
+        shutter,
     )

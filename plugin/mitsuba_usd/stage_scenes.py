@@ -13,25 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision import studio
 from mitsuba_subdivision.cage import CageError, in_digits, same
 from mitsuba_subdivision.files import require_usd
 from mitsuba_subdivision.messages import timed
 from mitsuba_subdivision.mitsuba_mesh import with_meshes
-from mitsuba_subdivision.studio import (
-    DEFAULT_SPP,
-    DEFAULT_VIEW,
-    MOST_SEGMENTS,
-    FrameFiles,
-    LoadedScene,
-    Look,
-    StillPicture,
-    View,
-    load_quietly,
-    outline_for,
-    set_parameters,
-    shading_for,
-    variant_in_use,
-)
 from mitsuba_subdivision.variants import SceneNode, variant_set
 from numpy.typing import NDArray
 
@@ -63,7 +49,7 @@ class StageScenes:
     def __init__(
         self,
         path: str | Path,  # A USD file; for frames also the name of several, with a number in it
-        look: Look,  # Its view, size and samples
+        look: studio.Look,  # Its view, size and samples
         parameters: dict[str, Any],  # Of every shape `subdivision`
         *,
         time: float | None = None,
@@ -79,11 +65,11 @@ class StageScenes:
         self._path, self._look, self._parameters = path, look, parameters
         self._time, self._camera = time, camera
         self._has_free_rates = not is_chosen(parameters)
-        self._files = None if numbers is None else FrameFiles(Path(path), numbers)
+        self._files = None if numbers is None else studio.FrameFiles(Path(path), numbers)
         if shutter and self._files is not None and self._files.are_many:
             raise CageError(f"{self.name}: there is one file for each frame; expected times of one file for a shutter")
         self._reader: StageReader | None = None
-        self._warned = {NO_BLUR} if shutter else set[str]()
+        self._notes = StageWarnings([NO_BLUR] if shutter else [])
         self._surfaces = Surfaces()
         self._first: tuple[int | None, SceneContents] | None = None
         self._is_lit = False
@@ -112,13 +98,14 @@ class StageScenes:
             require_usd(f'"{path}"')
             from .stage_walk import StageReader
 
-            self._reader = StageReader(path, self._camera, warned=self._warned)
+            self._reader = StageReader(path, self._camera, self._notes)
         contents = self._reader.at(None if time is None else time + delay)
         if mi.Float is not float:
             contents = with_large_copies(contents)
         self._parameters = with_rate(self._parameters, contents)
         if contents.has_surfaces:
-            self._parameters = {**self._parameters, "shading": shading_for(variant_in_use(), self._parameters)}
+            shading = studio.shading_for(studio.variant_in_use(), self._parameters)
+            self._parameters = {**self._parameters, "shading": shading}
         self._is_lit |= contents.is_lit
         return contents
 
@@ -136,7 +123,7 @@ class StageScenes:
             )
         return [opens + (closes - opens) * (part + 0.5) / self._shutter for part in range(self._shutter)]
 
-    def framing(self, contents: SceneContents) -> tuple[str, View, tuple[int, int]]:
+    def framing(self, contents: SceneContents) -> tuple[str, studio.View, tuple[int, int]]:
         """Axis that points up, view and size of the picture."""
         return contents.up, angles_for(contents, self._look), size_for(contents, self._look)
 
@@ -158,107 +145,103 @@ class StageScenes:
         turns: Sequence[NDArray[np.float64]] = (),
     ) -> SceneNode:
         """Entries of a scene, with polygon meshes for `with_meshes`. Raises CageError if no mesh can be used."""
-        notes, parameters = StageWarnings(), self._parameters
+        parameters = self._parameters
         rest: SceneNode = {}
         chosen: dict[ShapeContents, dict[str, Any]] = {}
         needed: dict[str, float] = {}
         is_one_picture = points is None
         points = self.points(contents) if points is None else points
         if len(points):
-            rest = with_studio_defaults(contents, points, self._is_lit, self._look, notes, self.name)
+            rest = with_studio_defaults(contents, points, self._is_lit, self._look, self._notes, self.name)
         if rest and (turns or follows_sensor):
             sensors = [_turned(rest["sensor"], turn) for turn in turns] or [rest["sensor"]]
             needed = texels_for_pictures(contents, sensors)
         if rest and is_one_picture:
-            contents, chosen = self._for_picture(contents, rest["sensor"], notes, follows_sensor)
+            contents, chosen = self._for_picture(contents, rest["sensor"], follows_sensor)
         else:
-            contents, parameters = self._with_copies(contents, notes)
+            contents, parameters = self._with_copies(contents)
         made = scene_entries(
             contents,
-            notes,
+            self._notes,
             parameters,
             self._surfaces,
-            Textures(notes, needed, self._look.texture_size),
+            Textures(self._notes, needed, self._look.texture_size),
             chosen,
             has_clear_lamps=bool(rest) and _has_clear_lamps(contents, rest),
         )
-        notes.warn(self.name, self._warned)
+        self._notes.warn(self.name)
         if not rest:
             raise CageError(f"{self.name}: none of the meshes can be used; expected one")
         return {**made, **rest}
 
     def _for_picture(
-        self, contents: SceneContents, sensor: SceneNode, notes: StageWarnings, follows_sensor: bool
+        self, contents: SceneContents, sensor: SceneNode, follows_sensor: bool
     ) -> tuple[SceneContents, dict[ShapeContents, dict[str, Any]]]:
         """Contents with copies, and parameters of limit surfaces with the triangles that a picture needs."""
         if not self._has_free_rates or not contents.has_surfaces:
-            return self._with_copies(contents, notes)[0], {}
-        outline, shading = outline_for(sensor), self._parameters["shading"]
+            return self._with_copies(contents)[0], {}
+        outline, shading = studio.outline_for(sensor), self._parameters["shading"]
         segments = segments_of(contents, self._surfaces, outline, sensor["near_clip"], shading)
         rates: dict[ShapeContents, int] = {}
         if mi.Float is not float:
-            most = {shape: np.minimum(needed, MOST_SEGMENTS) for shape, needed in segments.items()}
-            contents, rates = with_copies(contents, most, shading, notes)
+            most = {shape: np.minimum(needed, studio.MOST_SEGMENTS) for shape, needed in segments.items()}
+            contents, rates = with_copies(contents, most, shading, self._notes)
         triangles = triangles_for_picture(contents, segments, outline, self._parameters, follows_sensor=follows_sensor)
         triangles |= {shape: {"tessellation_rate": rate} for shape, rate in rates.items()}
         others = {name: value for name, value in self._parameters.items() if name != "tessellation_rate"}
         return contents, {shape: {**others, **more} for shape, more in triangles.items()}
 
-    def _with_copies(self, contents: SceneContents, notes: StageWarnings) -> tuple[SceneContents, dict[str, Any]]:
+    def _with_copies(self, contents: SceneContents) -> tuple[SceneContents, dict[str, Any]]:
         """Contents with copies, and parameters of every limit surface, if the camera moves or rates are chosen."""
         if mi.Float is float:
             return contents, self._parameters
-        rate = int(self._parameters.get("tessellation_rate", MOST_SEGMENTS))
+        rate = int(self._parameters.get("tessellation_rate", studio.MOST_SEGMENTS))
         copies = Counter(shape for shape, _ in contents.placed_shapes)
         rates = {shape: np.full(count, rate) for shape, count in copies.items() if shape.cage.scheme is not None}
-        shading = self._parameters.get("shading", "vertex")
-        contents, joined = with_copies(contents, rates, shading, notes, lowest=1 if self._has_free_rates else rate)
+        shading, lowest = self._parameters.get("shading", "vertex"), 1 if self._has_free_rates else rate
+        contents, joined = with_copies(contents, rates, shading, self._notes, lowest=lowest)
         if not self._has_free_rates:
             return contents, self._parameters
         return contents, {**self._parameters, "tessellation_rate": min([rate, *joined.values()])}
 
     def frames(
         self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
-    ) -> Iterator[LoadedScene]:
+    ) -> Iterator[studio.LoadedScene]:
         """The scenes of some frames and sub-frames; what stays, or moves with its topology, stays loaded.
 
         Raises CageError if there are to be sub-frames, and no camera has a shutter that opens.
         """
         self._surfaces = Surfaces()
         first = self._first[1] if self._first else self.at(numbers[0])
-        shapes, parameters = LoadedShapes(), self._with_copies(first, StageWarnings())[1]
-        # Its camera has notes in `_sensor`.
-        rest = with_studio_defaults(first, points, self._is_lit, self._look, StageWarnings(), self.name)
+        shapes, parameters = LoadedShapes(), self._with_copies(first)[1]
+        rest = with_studio_defaults(first, points, self._is_lit, self._look, self._notes, self.name)
         if self._needed is None:
             self._needed = self._texels_for_frames(first, rest)
-        before: tuple[SceneContents, SceneNode, LoadedScene] | None = None
+        before: tuple[SceneContents, SceneNode, studio.LoadedScene] | None = None
         for number, delay in product(numbers, self._delays(first)):
-            notes = StageWarnings()
             given = self._read(number, delay) if delay else self.at(number)
-            seen = self._sensor(given, first, rest, notes)
+            seen = self._sensor(given, first, rest)
             if before and same(before[0], given, _OF_CAMERA) and _moved_sensor(before[2], before[1], seen):
                 before = given, seen, before[2]
-                notes.warn(self.name, self._warned)
+                self._notes.warn(self.name)
                 yield before[2]
                 continue
-            contents, _ = self._with_copies(given, notes)
+            contents, _ = self._with_copies(given)
             shapes.begin_frame()
-            textures = Textures(notes, self._needed, self._look.texture_size)
+            textures = Textures(self._notes, self._needed, self._look.texture_size)
             is_clear = _has_clear_lamps(contents, rest)
             made = scene_entries(
-                contents, notes, parameters, Surfaces(), textures, loaded=shapes, has_clear_lamps=is_clear
+                contents, self._notes, parameters, Surfaces(), textures, loaded=shapes, has_clear_lamps=is_clear
             )
-            notes.warn(self.name, self._warned)
-            before = given, seen, load_quietly({**made, **rest, "sensor": seen}, filter_name)
+            self._notes.warn(self.name)
+            before = given, seen, studio.load_quietly({**made, **rest, "sensor": seen}, filter_name)
             yield before[2]
 
-    def _sensor(
-        self, contents: SceneContents, first: SceneContents, rest: SceneNode, notes: StageWarnings
-    ) -> SceneNode:
+    def _sensor(self, contents: SceneContents, first: SceneContents, rest: SceneNode) -> SceneNode:
         """The camera of a frame."""
         if contents.camera is None:
             return dict(rest["sensor"])
-        return sensor(contents.camera, size_for(first, self._look), self._look.spp, notes)
+        return sensor(contents.camera, size_for(first, self._look), self._look.spp, self._notes)
 
     def _texels_for_frames(self, first: SceneContents, rest: SceneNode) -> dict[str, float]:
         """Pixels along the sides of textures that any frame shows; of all frames, so that textures do not change."""
@@ -270,7 +253,7 @@ class StageScenes:
         # Lists of shapes are the same object as long as only the camera moves.
         for _, alike in groupby(at, lambda contents: contents.shapes):
             frames = list(alike)
-            seen = [self._sensor(frame, first, rest, StageWarnings()) for frame in frames]
+            seen = [self._sensor(frame, first, rest) for frame in frames]
             for file, texels in texels_for_pictures(frames[0], seen).items():
                 needed[file] = max(texels, needed.get(file, 0.0))
         return needed
@@ -281,7 +264,7 @@ def _has_clear_lamps(contents: SceneContents, rest: SceneNode) -> bool:
     return rest["integrator"]["type"] == "volpath" or any(light.kind == "dome" for light in contents.lights)
 
 
-def _moved_sensor(loaded: LoadedScene, before: SceneNode, seen: SceneNode) -> bool:
+def _moved_sensor(loaded: studio.LoadedScene, before: SceneNode, seen: SceneNode) -> bool:
     """Change the sensor of a scene from one entry to another; False, without any change, if that cannot be."""
     parameters = mi.traverse(loaded.sensor)
     # Of transforms of Mitsuba, != is always False.
@@ -289,7 +272,7 @@ def _moved_sensor(loaded: LoadedScene, before: SceneNode, seen: SceneNode) -> bo
     named = {_TRAVERSED.get(name, name): value for name, value in changed.items()}
     if before.keys() != seen.keys() or not all(name in parameters for name in named):
         return False
-    set_parameters(loaded.sensor, named)
+    studio.set_parameters(loaded.sensor, named)
     return True
 
 
@@ -305,8 +288,8 @@ def usd_scene(
     time: float | None = None,
     camera: str | None = None,
     size: tuple[int, int] | None = None,
-    spp: int = DEFAULT_SPP,
-    view: View = DEFAULT_VIEW,
+    spp: int = studio.DEFAULT_SPP,
+    view: studio.View = studio.DEFAULT_VIEW,
     texture_size: int | None = None,
     **parameters: Any,
 ) -> SceneNode:
@@ -373,6 +356,6 @@ def usd_scene(
     if texture_size is not None and texture_size < 1:
         raise ValueError(f"texture_size {texture_size}; expected 1 or more")
     with variant_set(mi):
-        look = Look(view, size, spp, texture_size=texture_size)
+        look = studio.Look(view, size, spp, texture_size=texture_size)
         source = StageScenes(path, look, parameters, time=time, camera=camera)
-        return with_meshes(StillPicture(source).scene)
+        return with_meshes(studio.StillPicture(source).scene)

@@ -10,21 +10,13 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from mitsuba_subdivision.cage import CageError, noting_warnings, shortened, warn, without_warnings
-from mitsuba_subdivision.files import (
-    HIDDEN_PURPOSES,
-    local_to_world,
-    open_stage,
-    require_types,
-    time_of,
-    usd_errors_at,
-    usd_messages_of,
-    value_at,
-)
+from mitsuba_subdivision import files
+from mitsuba_subdivision.cage import CageError, shortened
 from mitsuba_subdivision.messages import timed
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel
@@ -50,23 +42,17 @@ _SINGULAR = "instances with singular transforms are ignored"
 
 
 class StageReader:
-    """Reads a stage at several times.
-
-    Each warning is given once, however many times it applies to. Where cameras alone move, all but them is read once.
-    """
+    """Reads a stage at several times. Where cameras alone move, all but them is read once."""
 
     def __init__(
         self,
         path: str | Path,
         camera: str | None = None,  # Path of the camera. By default that of the stage's render settings, or the first
-        warned: set[str] | None = None,  # Warnings about other files, without their names; those about this are added
+        notes: StageWarnings | None = None,
     ) -> None:
-        self._path, self._camera = path, camera
+        self._path, self._camera, self._notes = path, camera, notes or StageWarnings()
         self._stage: Usd.Stage | None = None
-        # The first contents, and, from the second time on, whether they stay but for the camera.
-        self._first: SceneContents | None = None
-        self._is_still: bool | None = None
-        self._warned = set() if warned is None else warned
+        self._before: SceneContents | None = None
 
     def at(self, time: float | None = None) -> SceneContents:
         """Contents of the stage at a time code. Warns about everything that is ignored, once for each kind.
@@ -76,35 +62,22 @@ class StageReader:
         Raises ValueError if the time is not finite. Raises CageError if there is no such camera. Other errors are those
         of `open_stage`.
         """
+        name = f'"{self._path}"'
         if time is not None and not math.isfinite(time):
-            raise ValueError(f'"{self._path}": time {time}; expected a finite number, a time code')
-        messages: list[str] = []
-        try:
-            with noting_warnings() as messages, without_warnings():
-                return self._contents(f'"{self._path}"', time)
-        finally:
-            for message in messages:
-                what = message.replace(str(self._path), "")
-                if what not in self._warned:
-                    self._warned.add(what)
-                    warn(message)
+            raise ValueError(f"{name}: time {time}; expected a finite number, a time code")
+        with self._notes.given(str(self._path)):
+            self._stage = self._stage or files.open_stage(self._path, with_documents)
+            with files.usd_errors_at(name), files.usd_messages_of(name), timed("Reading") as at:
+                walk = _StageWalk(self._stage, name, time, self._notes, at)
+                if self._before is not None and self._is_still:
+                    camera, resolution = walk.camera(self._camera)
+                    return replace(self._before, camera=camera, resolution=resolution)
+                self._before = walk.contents(self._camera)
+                return self._before
 
-    def _contents(self, name: str, time: float | None) -> SceneContents:
-        self._stage = self._stage or open_stage(self._path, with_documents)
-        if self._first is not None and self._is_still is None:
-            self._is_still = is_still(self._stage)
-        notes = StageWarnings()
-        with usd_errors_at(name), usd_messages_of(name), timed("Reading") as at:
-            walk = _StageWalk(self._stage, name, time, notes, at)
-            if self._first is not None and self._is_still:
-                camera, resolution = walk.camera(self._camera)
-                contents = replace(self._first, camera=camera, resolution=resolution)
-            else:
-                contents = walk.contents(self._camera)
-                # Kept only where it may serve.
-                self._first = contents if self._is_still is None else None
-        notes.warn(name)
-        return contents
+    @cached_property
+    def _is_still(self) -> bool:
+        return is_still(self._stage)
 
 
 def is_still(stage: Usd.Stage) -> bool:
@@ -181,15 +154,12 @@ class _StageWalk:
             raise CageError(f'{self._name}: there is no camera "{path}"; expected one of those there are: {there}')
         to_world = self._to_world(cameras[path].GetPrim())
         try:
-            contents = replace(read_camera(cameras[path], to_world, self._code, self._notes), **changes)
+            return replace(read_camera(cameras[path], to_world, self._code, self._notes), **changes), resolution
         except (TypeError, ValueError):
-            contents = None
-        if contents is None or not contents.is_usable:
             raise CageError(
                 f"{self._location(cameras[path])}: the camera is not usable; expected finite numbers, and apertures "
                 "and a focal length above 0"
-            )
-        return contents, resolution
+            ) from None
 
     def _location(self, prim: Usd.Prim | UsdGeom.Camera) -> str:
         return f"{self._name}, prim {shortened(str(prim.GetPath()))}"
@@ -205,7 +175,7 @@ class _StageWalk:
             self._count += 1
             self._at(f"prim {self._count}")
             try:
-                with usd_errors_at(location):
+                with files.usd_errors_at(location):
                     self._add(prim, str(prim.GetPath()).removeprefix(above), root, to_root, below)
             except (CageError, AttributeError, TypeError, ValueError) as error:
                 message = str(error) if isinstance(error, CageError) else f"{location}: {error}"
@@ -220,7 +190,7 @@ class _StageWalk:
             imageable = UsdGeom.Imageable(prim)
             is_hidden = prim != root and prim.GetSpecifier() != Sdf.SpecifierDef
             if is_hidden or (
-                imageable and value_at(imageable.GetVisibilityAttr(), self._code) == UsdGeom.Tokens.invisible
+                imageable and files.value_at(imageable.GetVisibilityAttr(), self._code) == UsdGeom.Tokens.invisible
             ):
                 prims.PruneChildren()
                 continue
@@ -232,7 +202,7 @@ class _StageWalk:
         self, prim: Usd.Prim, name: str, root: Usd.Prim, to_root: NDArray[np.float64], below: SceneContents
     ) -> None:
         """Add what a prim shows."""
-        if value_at(prim.GetAttribute("model:drawMode"), self._code) not in _FULL_MODES:
+        if files.value_at(prim.GetAttribute("model:drawMode"), self._code) not in _FULL_MODES:
             self._notes.add("draw modes of models are ignored; their meshes are shown", prim.GetPath())
 
         def matrix() -> NDArray[np.float64]:
@@ -245,30 +215,18 @@ class _StageWalk:
                 below.instances.append(InstanceContents(name, group, placed))
             else:
                 self._notes.add(_SINGULAR, prim.GetPath())
-        elif not prim.IsA(UsdGeom.Imageable) or UsdGeom.Imageable(prim).ComputePurpose() in HIDDEN_PURPOSES:
+        elif not prim.IsA(UsdGeom.Imageable) or UsdGeom.Imageable(prim).ComputePurpose() in files.HIDDEN_PURPOSES:
             return
         elif prim.IsA(UsdGeom.PointInstancer):
             below.instances.extend(self._point_instances(UsdGeom.PointInstancer(prim), name, matrix()))
         elif prim.IsA(UsdGeom.Mesh) or str(prim.GetTypeName()) in GPRIMS:
             below.shapes.extend(replace(shape, name=name) for shape in self._shapes.read(prim, matrix()))
         elif prim.HasAPI(UsdLux.LightAPI):
-            light = self._light(prim, matrix())
+            files.require_types(prim, self._code)
+            light = read_light(prim, matrix(), self._code, self._notes)
             below.lights.extend([] if light is None else [replace(light, name=name)])
         elif str(prim.GetTypeName()) not in _SILENT:
             self._notes.add(f"prims of type {prim.GetTypeName()} are ignored", prim.GetPath())
-
-    def _light(self, prim: Usd.Prim, matrix: NDArray[np.float64]) -> LightContents | None:
-        """A light; None, with a note, if it cannot be used."""
-        try:
-            require_types(prim, self._code)
-            light = read_light(prim, matrix, self._code, self._notes)
-        except (TypeError, ValueError):
-            self._notes.add("lights with attributes of other types than UsdLux has are ignored", prim.GetPath())
-            return None
-        if light is not None and not light.is_usable:
-            self._notes.add("lights without a size, or with numbers that are not finite, are ignored", prim.GetPath())
-            return None
-        return light
 
     def _appearance(self, prim: Usd.Prim) -> tuple[object, ...]:
         """What an instance inherits that may make it look different from others of its prototype, and the prototype."""
@@ -276,7 +234,7 @@ class _StageWalk:
         skeleton, animation = binding.GetInheritedSkeleton(), binding.GetInheritedAnimationSource()
         # A skeleton outside moves the points of each instance otherwise.
         is_posed = skeleton and not skeleton.GetPath().HasPrefix(prim.GetPath())
-        is_hidden = UsdGeom.Imageable(prim) and UsdGeom.Imageable(prim).ComputePurpose() in HIDDEN_PURPOSES
+        is_hidden = UsdGeom.Imageable(prim) and UsdGeom.Imageable(prim).ComputePurpose() in files.HIDDEN_PURPOSES
         key = str(prim.GetPrototype().GetPath()), self._bindings(prim), bool(is_hidden)
         if key not in self._inherited:
             parts = list(_parts(prim))
@@ -288,18 +246,16 @@ class _StageWalk:
         names_read, is_placed = self._inherited[key]
         primvars = [UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name) for name in names_read]
         # Values and indices, to be compared.
-        texts = [str(value_at(primvar.GetAttr(), self._code)) if primvar else "" for primvar in primvars]
-        texts += [str(value_at(primvar.GetIndicesAttr(), self._code)) if primvar else "" for primvar in primvars]
+        texts = [str(files.value_at(primvar.GetAttr(), self._code)) if primvar else "" for primvar in primvars]
+        texts += [str(files.value_at(primvar.GetIndicesAttr(), self._code)) if primvar else "" for primvar in primvars]
         place = str(prim.GetPath()) if is_posed or is_placed else ""
         return *key, *texts, place, str(animation.GetPath()) if animation else ""
 
     def _bindings(self, prim: Usd.Prim) -> tuple[object, ...]:
         """Bindings of materials that an instance inherits or has; of collections, the materials of its parts."""
-        above = prim
-        while not above.IsPseudoRoot():
-            if above.GetPropertiesInNamespace("material:binding:collection"):
-                return tuple(self._materials.bound(part) for part in _parts(prim) if _is_shape(part))
-            above = above.GetParent()
+        above = (self._stage.GetPrimAtPath(path) for path in prim.GetPath().GetPrefixes())
+        if any(ancestor.GetPropertiesInNamespace("material:binding:collection") for ancestor in above):
+            return tuple(self._materials.bound(part) for part in _parts(prim) if _is_shape(part))
         bindings = []
         for purpose in (UsdShade.Tokens.allPurpose, UsdShade.Tokens.full, UsdShade.Tokens.preview):
             material, binding = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)
@@ -315,7 +271,7 @@ class _StageWalk:
         if path in self._open:
             self._notes.add("point instancers in their own prototypes are ignored", path)
             return []
-        require_types(prim, self._code)
+        files.require_types(prim, self._code)
         targets = instancer.GetPrototypesRel().GetForwardedTargets()
         kinds = np.array(instancer.GetProtoIndicesAttr().Get(self._code) or [], dtype=np.int64)
         if len(kinds) and not 0 <= kinds.min() <= kinds.max() < len(targets):
@@ -380,7 +336,7 @@ class _StageWalk:
         return self._numbers[key]
 
     def _to_world(self, prim: Usd.Prim) -> NDArray[np.float64]:
-        return np.array(local_to_world(prim, lambda attribute: time_of(attribute, self._code), self._transforms)).T
+        return np.array(files.local_to_world(prim, partial(files.time_of, time=self._code), self._transforms)).T
 
 
 def _add_copy(contents: SceneContents, prototype: SceneContents, instance: InstanceContents) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
-from mitsuba_subdivision.cage import shortened, warn
+from mitsuba_subdivision.cage import noting_warnings, shortened, warn, without_warnings
 
 # Prims that a message names, and characters of their names that it shows.
 _SHOWN, _LENGTH = 3, 200
@@ -13,9 +15,10 @@ _DETAILS = re.compile(r"\([^()]*\)|\"[^\"]*\"|(?<!\w)/\S+|\d+(?:[.,]\d+)*")
 
 
 class StageWarnings:
-    """Kinds of problems, and the affected prims."""
+    """Kinds of problems, and the affected prims. Each kind has one warning, for all times and files."""
 
-    def __init__(self) -> None:
+    def __init__(self, ignored: Iterable[str] = ()) -> None:
+        self._warned = set(ignored)
         self._prims: dict[str, list[str]] = {}
         # The first message of kinds of which each message names its prim.
         self._first: dict[str, str] = {}
@@ -26,23 +29,29 @@ class StageWarnings:
         if str(prim) not in prims:
             prims.append(str(prim))
 
-    def add_message(self, message: str, prim: object) -> None:
-        """Record a message that begins with the names of file and prim; messages of a kind differ in details."""
-        kind = _DETAILS.sub("", message.partition(": ")[2])
+    def add_message(self, message: str, prim: object, kind: str | None = None) -> None:
+        """Record a message that begins with the names of file and prim; those of a kind may differ in details."""
+        kind = _DETAILS.sub("", message.partition(": ")[2]) if kind is None else kind
         self._first.setdefault(kind, message)
         self.add(kind, prim)
 
-    def warn(
-        self,
-        name: str,  # Of the file, with which messages begin
-        warned: set[str] | None = None,  # Kinds that have had a warning, which are skipped; the others are added
-    ) -> None:
-        """Warn of each kind once."""
+    @contextmanager
+    def given(self, path: str) -> Iterator[None]:
+        """Warn of what is recorded in a ``with`` block when it ends, and of what is warned of in it."""
+        try:
+            with noting_warnings() as messages, without_warnings():
+                yield
+        finally:
+            for message in messages:
+                self.add_message(message, path, message.replace(path, ""))
+            self.warn(f'"{path}"')
+
+    def warn(self, name: str) -> None:
+        """Warn of each kind that has had no warning; messages begin with the name of the file."""
         for kind, prims in self._prims.items():
-            if warned is not None:
-                if kind in warned:
-                    continue
-                warned.add(kind)
+            if kind in self._warned:
+                continue
+            self._warned.add(kind)
             if kind not in self._first:
                 warn(f"{name}: {kind} ({_listed(prims)})")
             elif len(prims) == 1:
@@ -50,6 +59,8 @@ class StageWarnings:
             else:
                 others = "another prim" if len(prims) == 2 else f"{len(prims) - 1} other prims"
                 warn(f"{self._first[kind]}; likewise {others} ({_listed(prims[1:])})")
+        self._prims.clear()
+        self._first.clear()
 
 
 def _listed(prims: list[str]) -> str:

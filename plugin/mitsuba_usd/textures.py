@@ -15,7 +15,7 @@ from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
 from .contents import NodeContents, TextureContents, leaves, parts
-from .materialx_nodes import Values, evaluate, fallback_of, node
+from .materialx_nodes import Values, evaluate, fallback_of
 from .stage_warnings import StageWarnings
 from .texture_image import TextureImage, is_srgb_image, linear_values, read_texture_image, with_alpha
 
@@ -47,78 +47,70 @@ class Textures:
         self._pictures: dict[tuple[str, str | None], TextureImage | None] = {}
         # In eight bits, by file, channel and whether they are decoded.
         self._bitmaps: dict[tuple[str, str, bool], mi.Bitmap] = {}
-        self._expressions: dict[int, tuple[NodeContents, Baked]] = {}
+        # Expressions and their pictures, by the identity of the expression.
+        self._expressions: dict[int, tuple[NodeContents, TextureContents, TextureImage]] = {}
 
     def read(self, uses: Iterable[TextureContents]) -> None:
         """Read the pictures of textures on all processors."""
-        first = {key: use for use in uses if (key := _key(use.file, use)) not in self._pictures}
+        keys = list(dict.fromkeys((use.file, use.color_space) for use in uses))
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            pictures = pool.map(self._read, [file for file, _ in first], first.values())
-            for key, picture in zip(first, pictures, strict=True):
+            for key, picture in zip(keys, pool.map(self._read, keys), strict=True):
                 self._keep(key, picture)
 
     def color(self, given: TextureContents | NodeContents, *, is_radiance: bool = False) -> SceneNode:
         """A texture of colours, up to 1 unless of radiance, or the fallback of a picture that cannot be read."""
+        use, picture = self._used(given)
         most = None if is_radiance else 1.0
-        if isinstance(given, NodeContents):
-            values, to_uv, wrap = self._baked(given)
-            values = np.repeat(values, 3, axis=2) if values.shape[2] == 1 else values[..., :3]
-            # Two components are red and green.
-            values = np.pad(values, ((0, 0), (0, 0), (0, 3 - values.shape[2])))
-            return self._bitmap(np.clip(values, 0, most), to_uv, wrap, is_raw=False)
-        picture = self._picture(given.file, given)
         if picture is None:
-            numbers = np.broadcast_to(np.asarray(given.fallback)[given.channels], (3,))
-            return {"type": "rgb", "value": np.clip(numbers, 0, most).tolist()}
-        return self._plain(given, picture, is_raw=given.channel != "rgb")
+            return {"type": "rgb", "value": np.clip(np.broadcast_to(_fallback(use), (3,)), 0, most).tolist()}
+        if isinstance(given, NodeContents):
+            picture = replace(picture, pixels=np.clip(picture.pixels, 0, most))
+        return self._bitmap(use, picture, is_raw=use.channel != "rgb")
 
     def number(self, given: TextureContents | NodeContents) -> SceneNode | float:
         """A texture of numbers, or the fallback of a picture that cannot be read."""
-        if isinstance(given, NodeContents):
-            values, to_uv, wrap = self._baked(given)
-            return self._bitmap(values[..., :1], to_uv, wrap, is_raw=True)
-        picture = self._picture(given.file, given)
+        use, picture = self._used(given)
         if picture is None:
-            return float(given.fallback[given.channels[0]])
-        return self._plain(replace(given, channel=given.channel[0]), picture, is_raw=True)
+            return float(_fallback(use)[0])
+        return self._bitmap(replace(use, channel=use.channel[0]), picture, is_raw=True)
 
     def normals(self, given: TextureContents | NodeContents) -> SceneNode | None:
         """A texture of normals as Mitsuba has them, from 0 to 1; None if the picture cannot be read."""
-        if isinstance(given, NodeContents):
-            values, to_uv, wrap = self._baked(given)
-            return self._bitmap((values + 1) / 2, to_uv, wrap, is_raw=True)
-        halved = node("add", "vector3", in1=node("multiply", "vector3", in1=given, in2=0.5), in2=0.5)
-        picture = self._picture(given.file, given)
-        if picture is None or not isinstance(halved, TextureContents):
+        use, picture = self._used(given)
+        if picture is None:
             return None
-        return self._plain(halved, picture, is_raw=True)
+        scale, bias, fallback = (np.array([use.scale, use.bias, use.fallback]) + np.array([[0], [1], [1]])) / 2
+        use = replace(use, scale=scale.tolist(), bias=bias.tolist(), fallback=fallback.tolist())
+        return self._bitmap(use, picture, is_raw=True)
 
     def mean(self, given: TextureContents | NodeContents) -> NDArray[np.float64]:
         """Mean of a texture's values, ``(k,)``."""
-        if isinstance(given, NodeContents):
-            values: NDArray = self._baked(given)[0]
-        elif (source := self._source(given)) is not None:
-            values = source[0]
-        else:
-            return np.asarray(given.fallback)[given.channels]
-        return np.asarray(values.mean(axis=(0, 1), dtype=np.float64))
+        use, picture = self._used(given)
+        if picture is None:
+            return _fallback(use)
+        return np.asarray(_values(picture, use).mean(axis=(0, 1), dtype=np.float64))
 
-    def _baked(self, expression: NodeContents) -> Baked:
-        """Values of an expression, computed once."""
-        if id(expression) not in self._expressions:
-            # Kept with the expression, so that no other has its identity.
+    def _used(self, given: TextureContents | NodeContents) -> tuple[TextureContents, TextureImage | None]:
+        """A texture and its picture, or None if that cannot be read; of an expression, its values, computed once."""
+        if isinstance(given, TextureContents):
+            return given, self._picture(given.file, given.color_space)
+        if id(given) not in self._expressions:
             try:
-                values = baked(expression, self._source)
+                values, to_uv, wrap = baked(given, self._source)
             except (ValueError, IndexError):
-                what = f'expressions of "{expression.category}" with values of other types are ignored; 0.5 is used'
-                files = [source.file for source in leaves(expression) if isinstance(source, TextureContents)]
+                what = f'expressions of "{given.category}" with values of other types are ignored; 0.5 is used'
+                files = [source.file for source in leaves(given) if isinstance(source, TextureContents)]
                 self._notes.add(what, ", ".join(files))
-                values = np.full((1, 1, 1), 0.5, np.float32), np.eye(3), "repeat"
-            self._expressions[id(expression)] = expression, values
-        return self._expressions[id(expression)][1]
+                values, to_uv, wrap = np.full((1, 1, 1), 0.5, np.float32), np.eye(3), "repeat"
+            if values.shape[2] == 2:
+                # Red and green.
+                values = np.pad(values, ((0, 0), (0, 0), (0, 1)))
+            # Kept with the expression, so that no other has its identity.
+            self._expressions[id(given)] = given, TextureContents("", "rgb", "raw", wrap), TextureImage(values, to_uv)
+        return self._expressions[id(given)][1:]
 
     def _source(self, texture: TextureContents) -> tuple[NDArray, NDArray[np.float64]] | None:
-        picture = self._picture(texture.file, texture)
+        picture = self._picture(texture.file, texture.color_space)
         return None if picture is None else (_values(picture, texture), picture.to_uv)
 
     def radiance(self, path: str, scale: NDArray) -> mi.Bitmap | None:
@@ -129,29 +121,27 @@ class Textures:
         values = linear_values(with_alpha(picture.pixels), is_srgb_image(picture.pixels, "auto"))[..., :3] * scale
         return _linear_bitmap(values)
 
-    def _plain(self, texture: TextureContents, picture: TextureImage, is_raw: bool) -> SceneNode:
+    def _bitmap(self, texture: TextureContents, picture: TextureImage, is_raw: bool) -> SceneNode:
         """A texture of one picture, in eight bits if it has so many, as Mitsuba can keep them."""
-        to_uv, pixels, channels = picture.to_uv @ texture.to_uv, picture.pixels, texture.channels
+        pixels, channels = picture.pixels, texture.channels
         is_decoded = is_srgb_image(pixels, texture.color_space) and channels != [3]
         is_same = all(texture.scale[k] == 1 and texture.bias[k] == 0 for k in channels)
-        if pixels.dtype != np.uint8 or not is_same or picture.is_there is not None or (is_decoded and is_raw):
-            return self._bitmap(_values(picture, texture), to_uv, texture.wrap, is_raw)
         key = texture.file, texture.channel, is_decoded
-        if key not in self._bitmaps:
-            self._bitmaps[key] = mi.Bitmap(np.ascontiguousarray(_selected(pixels, channels)))
-            self._bitmaps[key].set_srgb_gamma(is_decoded)
-        return self._bitmap(self._bitmaps[key], to_uv, texture.wrap, is_raw)
+        if pixels.dtype != np.uint8 or not is_same or picture.is_there is not None or (is_decoded and is_raw):
+            bitmap = _linear_bitmap(_values(picture, texture))
+        else:
+            if key not in self._bitmaps:
+                self._bitmaps[key] = mi.Bitmap(np.ascontiguousarray(_selected(pixels, channels)))
+                self._bitmaps[key].set_srgb_gamma(is_decoded)
+            bitmap = self._bitmaps[key]
+        to_uv = mi.ScalarAffineTransform3f((_V_DOWN @ picture.to_uv @ texture.to_uv).tolist())
+        return {"type": "bitmap", "bitmap": bitmap, "raw": is_raw, "wrap_mode": texture.wrap, "to_uv": to_uv}
 
-    def _bitmap(self, values: NDArray | mi.Bitmap, to_uv: NDArray[np.float64], wrap: str, is_raw: bool) -> SceneNode:
-        bitmap = values if isinstance(values, mi.Bitmap) else _linear_bitmap(values)
-        transform = mi.ScalarAffineTransform3f((_V_DOWN @ to_uv).tolist())
-        return {"type": "bitmap", "bitmap": bitmap, "raw": is_raw, "wrap_mode": wrap, "to_uv": transform}
-
-    def _picture(self, path: str, use: TextureContents | None = None) -> TextureImage | None:
-        """A picture, as fine as its use needs; None if it cannot be read."""
-        key = _key(path, use)
+    def _picture(self, path: str, color_space: str | None = None) -> TextureImage | None:
+        """A picture, with a colour space as fine as it is needed; None if it cannot be read."""
+        key = path, color_space
         if key not in self._pictures:
-            self._keep(key, self._read(path, use))
+            self._keep(key, self._read(key))
         return self._pictures[key]
 
     def _keep(self, key: tuple[str, str | None], picture: TextureImage | Exception) -> None:
@@ -162,11 +152,12 @@ class Textures:
             self._notes.add("images that cannot be read are replaced by their fallback", f"{key[0]}: {reason}")
         self._pictures[key] = None if isinstance(picture, Exception) else picture
 
-    def _read(self, path: str, use: TextureContents | None) -> TextureImage | Exception:
+    def _read(self, key: tuple[str, str | None]) -> TextureImage | Exception:
+        path, color_space = key
         try:
-            if use is None:
+            if color_space is None:
                 return read_texture_image(path)
-            return read_texture_image(path, use.color_space, self._needed.get(path, np.inf), self._most)
+            return read_texture_image(path, color_space, self._needed.get(path, np.inf), self._most)
         except (RuntimeError, OSError, KeyError, zipfile.BadZipFile) as error:
             return error
 
@@ -177,8 +168,8 @@ def _linear_bitmap(values: NDArray) -> mi.Bitmap:
     return bitmap
 
 
-def _key(path: str, use: TextureContents | None) -> tuple[str, str | None]:
-    return path, None if use is None else use.color_space
+def _fallback(texture: TextureContents) -> NDArray[np.float64]:
+    return np.asarray(texture.fallback)[texture.channels]
 
 
 def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float32]:

@@ -6,6 +6,7 @@ import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest
+from mitsuba_subdivision import files
 from mitsuba_subdivision.cage.errors import CageError, CageWarning, warn
 from mitsuba_usd.contents import NodeContents, PrimvarContents, TextureContents
 from mitsuba_usd.stage_walk import StageReader
@@ -105,7 +106,7 @@ def test_warnings_keep_their_kind_and_are_given_before_an_error(stage, monkeypat
         raise CageError("the stage is unusable")
 
     reader = StageReader(stage(RED))
-    monkeypatch.setattr(reader, "_contents", read)
+    monkeypatch.setattr(files, "open_stage", read)
     with pytest.warns() as caught, pytest.raises(CageError, match="unusable"):
         reader.at()
     told_of = {warning.category: str(warning.message) for warning in caught}
