@@ -59,6 +59,13 @@ def perspective(size, origin, target=(0, 0, 0), up=(0, 0, 1), **more):
     return {"type": "perspective", "to_world": to_world, "film": size if isinstance(size, dict) else film(size), **more}
 
 
+def camera_rays(resolution, origin=(2.2, -3.2, 2.0), target=(0, 0, 0), fov=30):
+    """One through the middle of each pixel."""
+    y, x = (np.indices((resolution, resolution)).reshape(2, -1) + 0.5) / resolution
+    sensor = mi.load_dict(perspective(resolution, origin, target, fov=fov))
+    return sensor.sample_ray(0, 0.5, mi.Point2f(x, y), mi.Point2f(0.5))[0]
+
+
 def waves():
     """A texture in Python, without a gradient of its own."""
 

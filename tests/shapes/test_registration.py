@@ -5,6 +5,7 @@ import sys
 import threading
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
@@ -13,7 +14,8 @@ from mitsuba_subdivision.llvm import llvm_problem, require_llvm
 from mitsuba_subdivision.shapes import interaction_hook, register_variant
 from mitsuba_subdivision.shapes.interaction_hook import exact_shading_problem, hook_problem
 from shapes.cages import cube, described, load
-from shapes.scenes import vertices
+from shapes.scenes import down, scene_with, vertices
+from shapes.updates import update
 from shapes.variants import every_variant, exact_llvm, llvm, scalar
 
 STAR = Path(__file__).parents[2] / "scenes/cages/star.obj"
@@ -95,13 +97,20 @@ def test_known_variants_are_registered_once_from_many_threads():
 
 
 @every_variant
-def test_equal_shapes_of_a_dict_stay_two_and_can_be_written_as_xml():
-    one = described(cube(), tessellation_rate=3)
-    scene = mi.load_dict({"type": "scene", "left": one, "right": described(cube(), tessellation_rate=3)})
-    assert sorted(shape.id() for shape in scene.shapes()) == ["left", "right"]
-    assert {"left.control_points", "right.control_points"} <= {key for key, _ in mi.traverse(scene)}
+def test_equal_shapes_of_a_scene_stay_two_and_can_be_written_as_xml():
+    shape = described(cube(), tessellation_rate=3, bsdf={"type": "ref", "id": "m"})
+    aside = {"to_world": mi.ScalarTransform4f().translate([4, 0, 0])}
+    scene = scene_with(m={"type": "diffuse", "id": "m"}, a=shape, b=shape, c={**shape, **aside})
+    assert sorted(shape.id() for shape in scene.shapes()) == ["a", "b", "c"]
     # Whether or not objects of a scene are merged.
-    assert len(mi.load_dict({"type": "scene", "a": one, "b": one}, optimize=False).shapes()) == 2
+    assert (
+        len(mi.load_dict({"type": "scene", "a": described(cube()), "b": described(cube())}, optimize=False).shapes())
+        == 2
+    )
+    parameters = mi.traverse(scene)
+    update(parameters, {"a.control_points": parameters["a.control_points"] * 2})
+    a, c = (scene.ray_intersect(down(x, 0.1, 9)) for x in (0.1, 4.1))
+    assert dr.all(a.p.z > c.p.z + 0.5)
     of_file = {"type": "subdivision", "filename": "cage.obj", "tessellation_rate": 3}
     state = mi.parser.parse_dict(mi.parser.ParserConfig(mi.variant()), {"type": "scene", "left": of_file})
     text = mi.parser.write_string(state)
