@@ -64,12 +64,6 @@ def evaluate_from(surface, half_edge, uv):
     return surface.evaluate(element, uv, half_edge - elements.face_offsets[element])
 
 
-def both_sides(surface, half_edge, along):
-    """Samples of either face along edges of the cage, creases included, that begin at half-edges."""
-    for side, u in ((half_edge, along), (surface.cage.topology.twin[half_edge], 1 - along)):
-        yield evaluate_from(surface, side, np.stack([u, np.zeros_like(u)], axis=1))
-
-
 def patch_of(scheme, valence):
     """The irregular patch at an isolated extraordinary point."""
     scheme = scheme_named(scheme)

@@ -5,23 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from evaluation.common import both_sides, evaluate_from
+from evaluation.common import evaluate_from
 from mitsuba_subdivision import CageError, ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.evaluation import irregular_patch, patch_tree
 from mitsuba_subdivision.mesh.connectivity import VertexRule
-from patches.closed_cages import cube_with_valence_2, extraordinary_face, extraordinary_triangles
+from patches.closed_cages import bumpy, cube_with_valence_2, extraordinary_face
+from peers.fidelity_cages import SURFACES
 from reference.exact_samples import angle, faces_of
-from reference.refined_cages import (
-    differences_to_refined,
-    half_disc,
-    refined,
-    sheet,
-    spokes,
-    tagged,
-    upper_half,
-    with_bumps,
-)
+from reference.refined_cages import sheet, spokes, tagged
 
 pytestmark = pytest.mark.core
 
@@ -33,48 +25,7 @@ NORMAL = 1e-9
 WEIGHTS = 1e-13
 
 
-def star_of_creases(cage, valence, chosen):
-    """Creases along some of the edges of vertex 0."""
-    return spokes(cage, valence, [INFINITE * (spoke in chosen) for spoke in range(valence)])
-
-
-CAGES = {
-    "sheet": ("catmull_clark", sheet(4, 3)),
-    "one quad": ("catmull_clark", sheet(1, 1)),
-    "sheet without corners": ("catmull_clark", sheet(3, 2, boundary="edge_only")),
-    "dome": ("catmull_clark", extraordinary(5, closed=False)),
-    **{f"half disc of {k} triangles": ("catmull_clark", half_disc(k)) for k in (1, 2, 3, 4, 6)},
-    "triangle sheet": ("loop", sheet(4, 3, triangles=True)),
-    "triangle sheet without corners": ("loop", sheet(3, 2, triangles=True, boundary="edge_only")),
-    **{f"loop half disc of {k}": ("loop", half_disc(k)) for k in (1, 2, 3, 4, 6)},
-    "creased cube": ("catmull_clark", tagged(cube(), creases=[(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)])),
-}
-for n in (3, 4, 5, 6, 8):
-    # Of whole balls, where few samples are at the corner itself: the surface there is a cone, without one normal.
-    for kind, chosen, is_half in (("dart", [0], True), ("crease", [0, n // 2], True), ("corner", [0, 1, 2], False)):
-        quads, triangles = extraordinary(n, closed=not is_half), extraordinary_triangles(n)
-        triangles = upper_half(triangles) if is_half else triangles
-        CAGES[f"{kind} at valence {n}"] = ("catmull_clark", star_of_creases(quads, n, chosen))
-        CAGES[f"loop {kind} at valence {n}"] = ("loop", star_of_creases(triangles, n, chosen))
-# The faces around one end of a crease are those around the other, and close around it.
-TETRAHEDRON = ControlCage(
-    [[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]],
-    [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]],
-    creases=[(1, 3, INFINITE)],
-)
-CAGES |= {
-    "crease of one edge on a tetrahedron": ("catmull_clark", TETRAHEDRON),
-    "loop crease of one edge on a tetrahedron": ("loop", TETRAHEDRON),
-}
-
-EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAGES.keys())
-
-
-@EVERY_CAGE
-def test_one_refinement_has_the_same_surface(scheme, cage, np_rng):
-    points, normals = differences_to_refined(LimitSurface(with_bumps(cage), scheme), np_rng, levels=30)
-    assert points <= POSITION * 4
-    assert normals <= NORMAL
+KINDS = ("dart", "crease", "corner")
 
 
 def at_corners(surface, rng):
@@ -94,17 +45,20 @@ def with_vectors_turned_over(basis, rng):
     return replace(basis, vectors=basis.vectors * sign, inverse=basis.inverse * sign[:, None], blocks=blocks)
 
 
-BALLS = {
-    **{f"ball of valence {n}": ("catmull_clark", extraordinary(n)) for n in (3, 5, 8)},
-    **{f"loop ball of valence {n}": ("loop", extraordinary_triangles(n)) for n in (3, 5, 8)},
-    "doo_sabin ball": ("doo_sabin", extraordinary_face(5)),
-    "valence 2": ("catmull_clark", cube_with_valence_2()),
+PATCHES = {
+    **{name: ("catmull_clark", SURFACES[name]) for name in ("cube", "fan 8", "half disc of 6 triangles", "one quad")},
+    **{f"{kind} at valence 5": ("catmull_clark", SURFACES[f"{kind} of 10 at valence 5"]) for kind in KINDS},
+    **{f"loop {kind}": ("loop", SURFACES[f"Loop, {kind} of 10 at valence 3"]) for kind in KINDS},
+    **{f"loop {name}": ("loop", SURFACES[f"Loop, {name}"]) for name in ("bipyramid 7", "half disc of 4")},
+    "crease of one edge": ("catmull_clark", SURFACES["crease of one edge on a tetrahedron"]),
+    "doo_sabin face": ("doo_sabin", bumpy(extraordinary_face(5))),
+    "valence 2": ("catmull_clark", bumpy(cube_with_valence_2())),
 }
 
 
-@pytest.mark.parametrize(("scheme", "cage"), (CAGES | BALLS).values(), ids=CAGES | BALLS)
+@pytest.mark.parametrize(("scheme", "cage"), PATCHES.values(), ids=PATCHES)
 def test_signs_of_eigenvectors_do_not_matter(scheme, cage, np_rng, monkeypatch):
-    surface = LimitSurface(with_bumps(cage), scheme)
+    surface = LimitSurface(cage, scheme)
     places = at_corners(surface, np_rng)
     expected = surface.evaluate(*places)
     computed = irregular_patch.eigenbasis
@@ -128,20 +82,8 @@ def test_signs_of_eigenvectors_do_not_matter(scheme, cage, np_rng, monkeypatch):
     assert angle(samples.n, expected.n).max() <= NORMAL
 
 
-@EVERY_CAGE
-def test_refined_vertices_approach_the_surface(scheme, cage):
-    surface, errors = LimitSurface(with_bumps(cage), scheme), []
-    limit = surface.tessellate(1).positions[: surface.patches.topology.vertex_count]
-    for _ in range(4):
-        surface = refined(surface)
-        errors.append(np.abs(surface.cage.positions[: len(limit)] - limit).max())
-    # By 1/4 to 0.62 a level, the subdominant eigenvalue at high valence.
-    assert errors[3] <= 0.45 * errors[1] + POSITION
-    assert errors[1] < 0.1
-
-
 def test_a_border_is_a_cubic_spline_between_its_corners():
-    cage = with_bumps(sheet(3, 1))
+    cage = bumpy(sheet(3, 1))
     t = np.linspace(0, 1, 9)
     points = LimitSurface(cage).evaluate(1, np.stack([t, np.zeros_like(t)], axis=1)).p
     a, b, c, d = cage.positions[:4]
@@ -159,14 +101,18 @@ def test_corners_stay_and_other_ends_of_the_border_do_not():
 
 def test_a_crease_has_one_position_and_two_normals():
     cage = tagged(cube(), creases=[(4, 5, INFINITE), (5, 7, INFINITE), (7, 6, INFINITE), (6, 4, INFINITE)])
-    half_edge = int(np.flatnonzero((cage.face_vertices == 4) & (cage.face_vertices[cage.topology.next] == 5))[0])
-    one, other = both_sides(LimitSurface(cage), half_edge, np.linspace(0, 1, 7))
+    t, along = cage.topology, np.linspace(0, 1, 7)
+    (half_edge,) = np.flatnonzero((t.face_vertices == 4) & (t.face_vertices[t.next] == 5))
+    one, other = (
+        evaluate_from(LimitSurface(cage), side, np.stack([u, 0 * u], axis=1))
+        for side, u in ((half_edge, along), (t.twin[half_edge], 1 - along))
+    )
     assert np.abs(one.p - other.p).max() <= POSITION
     assert angle(one.n, other.n).min() > 10
 
 
 def test_a_dart_is_smooth_at_its_end():
-    surface = LimitSurface(with_bumps(star_of_creases(extraordinary(5), 5, [0])))
+    surface = LimitSurface(bumpy(spokes(extraordinary(5), 5, [INFINITE])))
     normals = [surface.evaluate(face, [[0.0, 0.0]]).n[0] for face in range(5)]
     assert max(angle(normals[0], normal) for normal in normals) <= NORMAL
 
@@ -223,7 +169,7 @@ def test_the_normal_at_a_corner_on_a_bent_crease_is_not_across_the_bend(scheme):
 
 
 def test_cut_sides_keep_faces_and_half_edges_and_uncreased_cages_are_not_cut():
-    cage = star_of_creases(extraordinary(6), 6, [0, 2, 4])
+    cage = spokes(extraordinary(6), 6, [INFINITE, 0, INFINITE, 0, INFINITE])
     cut = cage.cut_mesh
     assert np.array_equal(cut.vertex[cut.topology.face_vertices], cage.face_vertices)
     assert (cut.vertex == 0).sum() == 3

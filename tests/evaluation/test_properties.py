@@ -1,31 +1,18 @@
-"""Laws of evaluation on random closed cages."""
+"""Laws of evaluation: what maps and numbers of the cage do to the surface."""
 
 import numpy as np
-from evaluation.common import EVERY_SCHEME, evaluate_from
-from evaluation.random_cages import cages
-from hypothesis import given, settings
-from hypothesis import strategies as st
+import pytest
+from evaluation.common import evaluate_from
+from kernels.surfaces import SURFACES, random_locations, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
+from patches.closed_cages import SURFACES as CLOSED
+from patches.closed_cages import bumpy, cage_of, polygons
 from reference.bars import NORMAL, POINT
-from reference.exact_samples import angle, faces_of
+from reference.exact_samples import angle
 
-# The same examples in every run, and few: each random cage has some ten new classes to prepare.
-FEW = settings(derandomize=True, deadline=None, database=None, max_examples=8)
-SAMPLES = 12
+SAMPLES = 60
 # Derivatives relative to their own size, which near extraordinary points may be anything.
 DERIVATIVE = 1e-11
-
-
-def of_random_cages(law):
-    """Parametrise a law by scheme, and give it data to draw cages from and a seed for what else is random."""
-    return EVERY_SCHEME(given(data=st.data(), seed=st.integers(0, 99))(FEW(law)))
-
-
-def some_samples(surface, rng, count=SAMPLES):
-    """Corners of elements (half-edges of the element mesh), and parameters, some of them near the corner."""
-    half_edge = rng.integers(0, surface.patches.elements.half_edge_count, count)
-    uv = rng.random((count, 2)) * 0.5 ** rng.integers(0, 10, (count, 1)) / (2 if surface.scheme.name == "loop" else 1)
-    return half_edge, uv
 
 
 def assert_equal_derivatives(derivatives, expected, rounding=1):
@@ -33,15 +20,14 @@ def assert_equal_derivatives(derivatives, expected, rounding=1):
     assert (np.abs(derivatives - expected) / length).max() <= DERIVATIVE * rounding
 
 
-@of_random_cages
-def test_affine_maps_of_the_cage_are_those_of_the_surface(scheme, data, seed):
-    cage, rng = data.draw(cages(scheme)), np.random.default_rng(seed)
-    scale = 10 ** rng.uniform(-3, 3)
-    matrix, shift = scale * rng.standard_normal((3, 3)), rng.standard_normal(3)
-    samples = some_samples(surface := LimitSurface(cage, scheme), rng)
-    before = evaluate_from(surface, *samples)
-    moved = cage.with_positions(cage.positions @ matrix.T + shift)
-    after = evaluate_from(LimitSurface(moved, scheme), *samples)
+@pytest.mark.parametrize("name", SURFACES)
+def test_affine_maps_of_the_cage_are_those_of_the_surface(name, np_rng):
+    surface, scale = surface_named(name), 10 ** np_rng.uniform(-3, 3)
+    matrix, shift = scale * np_rng.standard_normal((3, 3)), np_rng.standard_normal(3)
+    samples = random_locations(surface, np_rng, SAMPLES, deepest=10)
+    before = surface.evaluate(*samples)
+    moved = surface.cage.with_positions(surface.cage.positions @ matrix.T + shift)
+    after = LimitSurface(moved, surface.scheme).evaluate(*samples)
     assert np.abs(before.p @ matrix.T + shift - after.p).max() <= POINT * np.abs(moved.positions).max()
     # The moved cage is rounded to its distance from the origin, which is the larger the smaller it is.
     rounding = (1 + 1 / scale) * np.linalg.cond(matrix)
@@ -51,19 +37,21 @@ def test_affine_maps_of_the_cage_are_those_of_the_surface(scheme, data, seed):
     assert angle(normal, after.n).max() <= NORMAL * rounding
 
 
-@of_random_cages
-def test_the_order_of_vertices_faces_and_corners_does_not_matter(scheme, data, seed):
-    cage, rng = data.draw(cages(scheme)), np.random.default_rng(seed)
-    faces = [face.tolist() for face in faces_of(cage)]
-    new_vertex, face_order = rng.permutation(cage.vertex_count), rng.permutation(len(faces))
-    turns = [int(rng.integers(len(face))) for face in faces]
+@pytest.mark.parametrize(("scheme", "name"), CLOSED)
+def test_the_order_of_vertices_faces_and_corners_does_not_matter(scheme, name, np_rng):
+    cage = bumpy(cage_of(scheme, name))
+    faces = polygons(cage.topology)
+    new_vertex, face_order = np_rng.permutation(cage.vertex_count), np_rng.permutation(len(faces))
+    turns = [int(np_rng.integers(len(face))) for face in faces]
     renamed = [[int(new_vertex[v]) for v in face[turn:] + face[:turn]] for face, turn in zip(faces, turns, strict=True)]
     positions = np.empty_like(cage.positions)
     positions[new_vertex] = cage.positions
     other = ControlCage(positions, [renamed[f] for f in face_order])
 
     one, two = LimitSurface(cage, scheme), LimitSurface(other, scheme)
-    half_edge, uv = some_samples(one, rng)
+    elements = one.patches.elements
+    element, uv, corner = random_locations(one, np_rng, SAMPLES, deepest=10)
+    half_edge = elements.face_offsets[element] + corner
     # The half-edge of either cage is the same corner of the same face.
     corner_of = one.patches.half_edge_of_corner[half_edge]
     face = cage.topology.face[corner_of]

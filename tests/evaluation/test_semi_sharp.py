@@ -4,116 +4,33 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from evaluation.common import both_sides, evaluate_from
-from evaluation.random_cages import octahedron
-from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary
+from evaluation.common import evaluate_from
+from mitsuba_subdivision import LimitSurface, SchemeError
+from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.schemes import CatmullClark
-from patches.closed_cages import extraordinary_face, extraordinary_triangles, prism
-from reference.exact_samples import angle, faces_of
-from reference.refined_cages import differences_to_refined, sheet, spokes, tagged, upper_half, with_bumps
-from reference.refinement import SharpMesh
+from patches.closed_cages import bipyramid, bumpy
+from peers.fidelity_cages import TOP
+from reference.refined_cages import channel_of, sheet, tagged
+from reference.refinement import refined
 
 # Of cages of size about 2, in float64.
 POSITION = 1e-14
-NORMAL = 1e-9
-LADDER = (0.3, 0.5, 1, 1.7, 2.5, 4)
-
-
-TOP = ((4, 5), (5, 7), (7, 6), (6, 4))
-BALLS = {"catmull_clark": cube(), "loop": ControlCage(*octahedron())}
-
-
-def ring(*sharpness, **options):
-    """A cube with creases around its top, of one sharpness or of one each."""
-    edges = zip(TOP, sharpness * 4 if len(sharpness) == 1 else sharpness, strict=True)
-    return tagged(cube(), creases=[(a, b, s) for (a, b), s in edges], **options)
+BALLS = {"catmull_clark": cube(), "loop": bipyramid(4)}
 
 
 def sharp_ball(scheme, sharpness, spread, method, **options):
     """Creases along all edges, of sharpness from ``sharpness`` down to nearly ``spread`` less."""
     cage = BALLS[scheme]
-    t = cage.topology
-    ends = [(t.face_vertices[h], t.face_vertices[t.next[h]]) for h in t.edge_half_edge]
-    fall = spread * np.arange(len(ends)) / len(ends)
-    creases = [(int(a), int(b), sharpness - less) for (a, b), less in zip(ends, fall, strict=True)]
+    fall = spread * np.arange(len(cage.edges)) / len(cage.edges)
+    creases = np.column_stack([cage.edges, sharpness - fall])
     return tagged(cage, creases=creases, crease_method=method, **options)
 
 
-CAGES = {
-    **{f"cube, ring of {s}": ("catmull_clark", ring(s)) for s in LADDER},
-    "cube, one sharpness after the other": ("catmull_clark", ring(0.4, 1.3, 2.2, 3.1)),
-    "sharp vertices": ("catmull_clark", tagged(cube(), corners=[(0, 0.7), (1, 1.0), (3, 2.4)])),
-    "sharp vertex on a crease": ("catmull_clark", ring(10, corners=[(4, 1.6)])),
-    "sharp vertex on a border": ("catmull_clark", sheet(3, 3, corners=[(1, 1.4), (5, 0.6)])),
-    "along a border and from it": ("catmull_clark", sheet(3, 3, creases=[(1, 2, 0.7), (2, 3, 2.5), (2, 6, 1.5)])),
-    "crease into a border": ("catmull_clark", sheet(3, 3, creases=[(1, 5, 1.5), (5, 9, 0.5)])),
-    "pentagon": ("catmull_clark", tagged(upper_half(extraordinary_face(5)), creases=[(0, 1, 1.5), (1, 2, 0.7)])),
-    "smooth triangles": ("catmull_clark", tagged(prism(), triangle_rule="smooth")),
-    "triangle sheet": ("loop", sheet(3, 3, triangles=True, creases=[(5, 6, 1.5), (6, 10, 0.7)], corners=[(9, 1.2)])),
-}
-for kind, sharpness in {
-    "dart": (1.5,),
-    "crease": (1.5, 0, 2.5),
-    "corner": (0.5, 1.5, 2.5),
-    "into a crease": (10, 1.5, 10),
-    "beyond a crease": (10, 0, 10, 1.5),
-    "briefly beyond a crease": (10, 0, 10, 0.7),
-    "both sides of a crease": (10, 0.8, 10, 2.5),
-    "into a dart": (10, 1.5),
-    "corner that becomes a dart": (10, 1.5, 0.5),
-    "into a corner": (10, 10, 10, 1.5),
-    "into a corner from several sides": (10, 1.5, 10, 10, 2.5),
-}.items():
-    CAGES[kind] = ("catmull_clark", spokes(extraordinary(5, closed=False), 5, sharpness))
-    CAGES[f"loop {kind}"] = ("loop", spokes(upper_half(extraordinary_triangles(5)), 5, sharpness))
-for name, (scheme, cage) in list(CAGES.items()):
-    creases, corners = cage.tags.creases(cage.topology), cage.tags.corners()
-    if len(creases) > 1 and "ring of" not in name:
-        CAGES[f"chaikin {name}"] = scheme, tagged(cage, creases=creases, corners=corners, crease_method="chaikin")
-
-EVERY_CAGE = pytest.mark.parametrize(("scheme", "cage"), CAGES.values(), ids=CAGES.keys())
-
-
-def slow_mesh(scheme, cage):
-    t, creases = cage.topology, cage.tags.creases(cage.topology)
-    ends_of_border = np.flatnonzero(t.is_border_vertex & (t.vertex_face_count == 1)).tolist()
-    return SharpMesh(
-        scheme,
-        cage.positions,
-        [tuple(face) for face in faces_of(cage)],
-        {frozenset((int(a), int(b))): float(s) for a, b, s in creases},
-        {**dict.fromkeys(ends_of_border, 10.0), **{int(v): float(s) for v, s in cage.tags.corners()}},
-        cage.crease_method,
-        cage.triangle_rule == "smooth",
-    )
-
-
-@pytest.mark.core
-@EVERY_CAGE
-def test_one_refinement_has_the_same_surface(scheme, cage, np_rng):
-    points, normals = differences_to_refined(LimitSurface(with_bumps(cage), scheme), np_rng, levels=12)
-    assert points <= POSITION * 4
-    assert normals <= NORMAL
-
-
-@pytest.mark.core
-@EVERY_CAGE
-def test_neighbours_agree_along_edges(scheme, cage, np_rng):
-    surface = LimitSurface(with_bumps(cage), scheme)
-    t = cage.topology
-    whole = (cage.face_sizes == surface.scheme.domain.corner_count)[t.face]
-    half_edge = np_rng.choice(np.flatnonzero((t.twin >= 0) & whole & whole[t.twin]), 60)
-    one, other = both_sides(surface, half_edge, np_rng.random(60))
-    assert np.abs(one.p - other.p).max() <= POSITION * 4
-    smooth = cage.tags.edges[half_edge] < 10
-    assert angle(one.n[smooth], other.n[smooth]).max() <= NORMAL
-
-
 def test_sharpness_10_is_infinite_and_9_nearly():
-    infinite, nearly, smooth = (LimitSurface(with_bumps(ring(s))).tessellate(4).positions for s in (10, 9, 0))
+    cages = (bumpy(tagged(cube(), creases=[(*edge, s) for edge in TOP])) for s in (10, 9, 0))
+    infinite, nearly, smooth = (LimitSurface(cage).tessellate(4).positions for cage in cages)
     assert np.abs(smooth.max(axis=0) - infinite.max(axis=0)).max() > 0.05
     # The crease of 9 follows the other to half a thousandth of an edge.
     distance = np.linalg.norm(infinite[:, None] - nearly[None], axis=2).min(axis=1)
@@ -165,7 +82,7 @@ def assert_part(part, whole, faces):
 
 @pytest.mark.core
 def test_holes_shape_the_surface_but_are_not_part_of_it():
-    cage = with_bumps(sheet(3, 3))
+    cage = bumpy(sheet(3, 3))
     pierced = LimitSurface(tagged(cage, holes=[4, 0])).tessellate(3)
     assert_part(pierced, LimitSurface(cage).tessellate(3), set(range(9)) - {0, 4})
 
@@ -178,7 +95,7 @@ def test_holes_are_no_elements():
 
 
 def test_boundary_none_leaves_the_faces_that_do_not_touch_it():
-    cage = with_bumps(sheet(4, 4))
+    cage = bumpy(sheet(4, 4))
     inner = LimitSurface(tagged(cage, boundary="none")).tessellate(2)
     assert_part(inner, LimitSurface(cage).tessellate(2), {5, 6, 9, 10})
     with pytest.raises(SchemeError, match='boundary "none" leaves no face'):
@@ -192,13 +109,14 @@ def around(mesh, vertex):
         faces = [face for face in mesh.faces if near & {*face}]
         near = {v for face in faces for v in face}
     number = {v: k for k, v in enumerate(sorted(near))}
-    kept = SharpMesh(
-        mesh.scheme,
-        mesh.points[sorted(near)],
-        [tuple(number[v] for v in face) for face in faces],
-        {frozenset(number[v] for v in edge): s for edge, s in mesh.edges.items() if edge <= near},
-        {number[v]: s for v, s in mesh.vertices.items() if v in near},
-        mesh.method,
+    values = {v: value for (v, _), value in mesh.values.items()}
+    kept = replace(
+        mesh,
+        faces=[tuple(number[v] for v in face) for face in faces],
+        indices=[(0,) * len(face) for face in faces],
+        values={(k, 0): values[v] for v, k in number.items()},
+        creases={frozenset(number[v] for v in edge): s for edge, s in mesh.creases.items() if edge <= near},
+        corners={number[v]: s for v, s in mesh.corners.items() if v in near},
     )
     return kept, number[vertex]
 
@@ -211,23 +129,24 @@ LASTING, CLOSE = 22, 1e-9
 @pytest.mark.parametrize("method", ["uniform", "chaikin"])
 @pytest.mark.parametrize("scheme", BALLS)
 def test_lasting_features_have_the_limits_of_brute_force(scheme, method, np_rng):
-    cage = with_bumps(sharp_ball(scheme, 9.9, 0.9, method, corners=[(0, 9.6), (2, 4.3)]))
-    surface, slow = LimitSurface(cage, scheme), slow_mesh(scheme, cage)
-    sizes = cage.topology.face_sizes
-    element = np_rng.integers(0, cage.face_count)
-    descents = [[int(np_rng.integers(0, sizes[0])) for _ in range(3)] for _ in range(4)]
+    cage = bumpy(sharp_ball(scheme, 9.9, 0.9, method, corners=[(0, 9.6), (2, 4.3)]))
+    surface, points = LimitSurface(cage, scheme), channel_of(cage, cage.positions, cage.face_vertices)
+    size = int(cage.face_sizes[0])
+    element = int(np_rng.integers(0, cage.face_count))
+    descents = np_rng.integers(0, size, (2, 3)).tolist()
     # The face at corner 0 of the one at corner 0 keeps a vertex of the cage.
     for corners in [[0, 0, 0], *descents]:
-        face, mesh, uv = int(element), slow, np.zeros((1, 2))
+        face, mesh, uv = element, points, np.zeros((1, 2))
         for corner in corners:
-            face, mesh = face * int(sizes[0]) + corner, mesh.refined()
+            face, (mesh, _) = face * size + corner, refined(mesh, scheme)
         for corner in corners[::-1]:
             uv = surface.scheme.domain.rotation(corner)(uv / 2)
         vertex = mesh.faces[face][0]
         for _ in range(LASTING):
             mesh, vertex = around(mesh, vertex)
-            mesh = mesh.refined()
-        assert np.abs(surface.evaluate(element, uv).p[0] - mesh.points[vertex]).max() <= CLOSE
+            mesh, _ = refined(mesh, scheme)
+        (limit,) = (value for (v, _), value in mesh.values.items() if v == vertex)
+        assert np.abs(surface.evaluate(element, uv).p[0] - limit).max() <= CLOSE
 
 
 class RolledFaces(CatmullClark):
@@ -248,7 +167,7 @@ class RolledFaces(CatmullClark):
 
 
 def test_the_order_in_which_a_scheme_numbers_faces_does_not_matter(np_rng):
-    cage = with_bumps(sharp_ball("catmull_clark", 4.9, 0.9, "chaikin"))
+    cage = bumpy(sharp_ball("catmull_clark", 4.9, 0.9, "chaikin"))
     scheme = RolledFaces()
     scheme.crease_method = "chaikin"
     signature = LimitSurface(cage).patches.classes[0].signature

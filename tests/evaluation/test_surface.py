@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface, SchemeError, limit_stencil
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.schemes import CatmullClark, scheme_named, with_rules
 from patches.closed_cages import tetrahedron
+from reference.bars import NORMAL
+from reference.exact_samples import angle
 
 
 def test_arguments_broadcast():
@@ -78,6 +81,27 @@ def test_the_stabilised_form_in_float32_moves_no_vertex_of_a_tessellation(cage):
     single = surface.tessellate(4, dtype=np.float32, sample_offset=1e-7)
     assert np.abs(precise.positions - single.positions).max() < 1e-5
     assert (precise.normals * single.normals).sum(axis=1).min() > 1 - 1e-6
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("name", SURFACES)
+def test_neighbours_agree_along_edges(name, np_rng):
+    """Seen from the vertex where they begin: along u of the face on their left, along v of the one on their right."""
+    surface, along = surface_named(name), np_rng.random(60) / 2
+    is_primal = surface.scheme.element == "face"
+    t = surface.cage.topology if is_primal else surface.patches.elements
+    is_element = surface.patches.elements.face_sizes > 0
+    inner = np.flatnonzero((t.twin >= 0) & is_element[t.face] & is_element[t.face[t.twin]])
+    half_edge, samples = np_rng.choice(inner, 60), []
+    for corner, direction in ((half_edge, (1, 0)), (t.next[t.twin[half_edge]], (0, 1))):
+        element = t.face[corner]
+        # Of an element that is not whole, u and v reach the middle of the edge.
+        u = along * np.where(surface.patches.is_whole[element], 1, 2)
+        samples.append(surface.evaluate(element, np.outer(u, direction), corner - t.face_offsets[element]))
+    one, other = samples
+    assert np.abs(one.p - other.p).max() <= 1e-14 * max(1, np.abs(surface.cage.positions).max())
+    smooth = surface.cage.tags.edges[half_edge] < 10 if is_primal else slice(None)
+    assert angle(one.n[smooth], other.n[smooth]).max(initial=0) <= NORMAL
 
 
 def test_a_sample_offset_moves_extraordinary_vertices_only():

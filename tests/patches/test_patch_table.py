@@ -1,17 +1,18 @@
 import numpy as np
 import pytest
-from evaluation.test_semi_sharp import CAGES as SEMI_SHARP
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.mesh.one_ring import one_ring
 from mitsuba_subdivision.mesh.signature import FEW_CODES, NEAR_FACES, row_codes, signature_at
 from mitsuba_subdivision.patches.patch_table import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
 from patches.closed_cages import CLOSED_CAGES, SURFACES, cage_of, polygons, torus, triangulated
+from peers.fidelity_cages import SURFACES as TAGGED
 from reference.exact_samples import mesh_of
 
 pytestmark = pytest.mark.core
 
-EVERY_CAGE = {f"{scheme} {name}": (scheme, cage_of(scheme, name)) for scheme, name in SURFACES} | SEMI_SHARP
+EVERY_CAGE = {f"{scheme} {name}": (scheme, cage_of(scheme, name)) for scheme, name in SURFACES}
+EVERY_CAGE |= {name: (None, TAGGED[name]) for name in TAGGED if "semi-sharp" in name or "Chaikin" in name}
 EVERY_SURFACE = pytest.mark.parametrize(("scheme", "name"), SURFACES)
 
 

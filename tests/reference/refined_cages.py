@@ -9,8 +9,9 @@ from mitsuba_subdivision.mesh.cuts import CutMesh
 from mitsuba_subdivision.mesh.shared import Shared
 from mitsuba_subdivision.patches import patch_table
 from mitsuba_subdivision.surface import limit_surface
+from patches.closed_cages import polygons
 
-from reference.exact_samples import angle, bumpy
+from reference.refinement import Channel
 
 
 def sheet(columns, rows, *, triangles=False, **options):
@@ -54,9 +55,20 @@ def spokes(cage, valence, sharpness):
     return tagged(cage, creases=[(0, far, s) for far, s in zip(ring, sharpness, strict=False) if s])
 
 
-def with_bumps(cage):
-    """The cage with its vertices moved, so that nothing is flat."""
-    return cage.with_positions(bumpy(cage, 1).positions)
+def channel_of(cage, values, indices, mode="none"):
+    """What the reference has of a cage and values at its corners; of points, these and the faces' vertices."""
+    keys = zip(cage.face_vertices.tolist(), indices.tolist(), strict=True)
+    return Channel(
+        polygons(cage.topology),
+        [tuple(rows) for rows in np.split(indices, cage.topology.face_offsets[1:-1])],
+        {key: values[key[1]] for key in keys},
+        {frozenset((int(a), int(b))): float(s) for a, b, s in cage.tags.creases(cage.topology)},
+        {int(vertex): float(s) for vertex, s in cage.tags.corners()},
+        cage.boundary == "edge_and_corner",
+        mode,
+        cage.crease_method,
+        cage.triangle_rule == "smooth",
+    )
 
 
 def refined(surface):
@@ -72,23 +84,6 @@ def refined(surface):
     vars(structure)["cut"] = CutMesh(t, np.arange(t.vertex_count))
     vars(cage).update(topology=t, structure=structure)
     return LimitSurface(cage, surface.scheme)
-
-
-def differences_to_refined(surface, np_rng, levels, count=200):
-    """Points' distance and normals' angle in degrees between a surface and that of its refined cage.
-
-    At samples down to ``2**-levels`` from all corners, and at corners.
-    """
-    cage, finer = surface.cage, refined(surface)
-    element = np_rng.integers(0, cage.face_count, count)
-    corner = np_rng.integers(0, cage.face_sizes[element])
-    uv = np_rng.random((count, 2)) * 0.25 * 2.0 ** -np_rng.integers(0, levels, (count, 1))
-    uv[:20] = 0
-    # Corner h of an element is element h after refinement, at twice the parameters; a polygon's is at its own.
-    halved = (cage.face_sizes[element] == surface.scheme.domain.corner_count)[:, None]
-    here = surface.evaluate(element, uv, corner)
-    there = finer.evaluate(cage.topology.face_offsets[element] + corner, np.where(halved, 2 * uv, uv))
-    return np.abs(here.p - there.p).max(), angle(here.n, there.n).max()
 
 
 def refine_first(monkeypatch, many_classes=0):

@@ -8,8 +8,6 @@ A mesh is a list of faces (tuples of vertices), a channel a list of index tuples
 values by (vertex, index): the same index at two vertices is two values. Points are a channel without seams.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import dataclass, replace
 from math import cos, pi
@@ -45,45 +43,11 @@ class Channel:
     values: dict
     creases: dict
     corners: dict
-    sharp_boundary_corners: bool
-    mode: str
+    sharp_boundary_corners: bool = False
+    mode: str = "none"
     method: str = "uniform"
     smooth_triangles: bool = False
     followed: dict | None = None
-
-
-@dataclass
-class SharpMesh:
-    """Polygon mesh with a sharpness for each edge, a frozenset of two vertices, and vertex; border edges are infinite.
-
-    ``scheme`` is "catmull_clark" or "loop", ``method`` "uniform" or "chaikin".
-    """
-
-    scheme: str
-    points: np.ndarray
-    faces: list[tuple[int, ...]]
-    edges: dict[frozenset, float]
-    vertices: dict[int, float]
-    method: str = "uniform"
-    smooth_triangles: bool = False
-
-    def refined(self) -> SharpMesh:
-        """One refinement, with the faces of `refined`. Vertices keep their numbers; new ones come after them."""
-        values = {(vertex, 0): point for vertex, point in enumerate(self.points)}
-        indices, options = [(0,) * len(face) for face in self.faces], (self.method, self.smooth_triangles)
-        channel = Channel(self.faces, indices, values, self.edges, self.vertices, False, "none", *options)
-        finer, _ = refined(channel, self.scheme)
-        number = {("vertex", vertex): vertex for vertex in range(len(self.points))}
-        for vertex, _ in finer.values:
-            number.setdefault(vertex, len(number))
-        points = {number[vertex]: point for (vertex, _), point in finer.values.items()}
-        return replace(
-            self,
-            points=np.array([points[k] for k in range(len(points))]),
-            faces=[tuple(number[vertex] for vertex in face) for face in finer.faces],
-            edges={frozenset(number[vertex] for vertex in edge): s for edge, s in finer.creases.items()},
-            vertices={number[vertex]: s for vertex, s in finer.corners.items()},
-        )
 
 
 class _Around:
@@ -195,9 +159,17 @@ class _Around:
 
 
 def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
-    """Refine once; also what becomes of each face's corners: ``{(face, corner): refined face}``, its corner first."""
+    """Refine once; also what becomes of each face's corners: ``{(face, corner): refined face}``, its corner first.
+
+    Vertices keep their numbers; new ones come after them.
+    """
     around, c = _Around(channel), channel
-    values, faces, indices, child = {}, [], [], {}
+    count, values, rings, middles, child = 1 + max(map(max, c.faces)), {}, [], [], {}
+    numbers = {}
+
+    def number(origin):
+        """The vertex that an edge, or a face by its number, becomes."""
+        return numbers.setdefault(origin, count + len(numbers))
 
     def add(vertex, index, value):
         values[vertex, index] = value
@@ -206,7 +178,7 @@ def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
     def edge_value(edge, f):
         i = next(i for g, i in around.at_edge[edge] if g == f)
         middle = (around.value(f, i) + around.value(f, i + 1)) / 2
-        key, cut, sharpness = ("edge", edge), around.is_seam(edge), around.sharpness(edge)
+        key, cut, sharpness = number(edge), around.is_seam(edge), around.sharpness(edge)
         side = f if cut else None
         if (key, side) in values:
             return key, side
@@ -221,31 +193,25 @@ def refined(channel: Channel, scheme: str) -> tuple[Channel, dict]:
         return add(key, side, sharpness * middle + (1 - sharpness) * smooth)
 
     def vertex_value(f, i):
-        vertex, index = c.faces[f][i], c.indices[f][i]
-        key = "vertex", vertex
-        return (key, index) if (key, index) in values else add(key, index, _moved(around, vertex, index, scheme))
+        key = c.faces[f][i], c.indices[f][i]
+        return key if key in values else add(*key, _moved(around, *key, scheme))
 
-    middles: list[list] = []
     for f, face in enumerate(c.faces):
         n = len(face)
         corners = [vertex_value(f, i) for i in range(n)]
         edges = [edge_value(frozenset((face[i], face[(i + 1) % n])), f) for i in range(n)]
-        centre = None if scheme == "loop" else add(("face", f), None, around.face_means[f])
+        centre = [] if scheme == "loop" else [add(number(f), None, around.face_means[f])]
         for i in range(n):
-            child[f, i] = len(faces)
-            ring = [corners[i], edges[i], *([] if centre is None else [centre]), edges[i - 1]]
-            faces.append(tuple(vertex for vertex, _ in ring))
-            indices.append(tuple(index for _, index in ring))
-        if centre is None:
+            child[f, i] = len(rings)
+            rings.append([corners[i], edges[i], *centre, edges[i - 1]])
+        if not centre:
             middles.append(edges)
     # As the package, with the middle triangles of Loop's scheme after all others.
-    faces += [tuple(vertex for vertex, _ in middle) for middle in middles]
-    indices += [tuple(index for _, index in middle) for middle in middles]
-    creases = {frozenset((("vertex", v), ("edge", edge))): around.left(edge, v) for edge in c.creases for v in edge}
-    corners = {("vertex", vertex): less(sharpness) for vertex, sharpness in c.corners.items()}
-    followed = {(("vertex", v), i): (("vertex", w), j) for (v, i), (w, j) in c.followed.items()}
+    faces, indices = ([tuple(key[k] for key in ring) for ring in rings + middles] for k in (0, 1))
+    creases = {frozenset((v, number(edge))): around.left(edge, v) for edge in c.creases for v in edge}
+    corners = {vertex: less(sharpness) for vertex, sharpness in c.corners.items()}
     of_mesh = {"faces": faces, "indices": indices, "values": values, "creases": creases, "corners": corners}
-    return replace(c, **of_mesh, smooth_triangles=False, followed=followed), child
+    return replace(c, **of_mesh, smooth_triangles=False), child
 
 
 def _moved(around, vertex, index, scheme):
