@@ -8,8 +8,7 @@ from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.evaluation.divided_tile import part_of_tile
 from mitsuba_subdivision.evaluation.element import element_stencils
-from mitsuba_subdivision.evaluation.patch_tree import isolated_signature, patch_tree, patch_trees
-from mitsuba_subdivision.evaluation.refined_rings import refined_children
+from mitsuba_subdivision.evaluation.patch_tree import isolated_signature, patch_tree, patch_trees, refined_children
 from mitsuba_subdivision.mesh.signature import Fan, Signature
 from mitsuba_subdivision.patches.patch_table import PatchTable
 from mitsuba_subdivision.schemes import CatmullClark, SchemeError

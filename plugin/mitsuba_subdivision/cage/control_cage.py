@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..device_arrays import mapped
-from ..mesh.connectivity import IndexArray, IntArray, Topology
+from ..mesh.connectivity import CreaseMethod, IndexArray, IntArray, Topology
 from ..mesh.cuts import CutMesh, SharpMesh, Sharpness
 from ..mesh.manifold import NonManifold
-from ..mesh.sharpness import CreaseMethod
 from ..variants import variant_module
 from .contents import RULES, Attribute, CageContents, validated_attribute
 from .errors import CageError, CageSource

@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..mesh.connectivity import IntArray, Topology
+from ..mesh.connectivity import INFINITE, IntArray, Topology
 from ..mesh.cuts import Sharpness
 from ..mesh.manifold import (
     NonManifold,
@@ -24,7 +24,6 @@ from ..mesh.manifold import (
     separated,
     turning_order,
 )
-from ..mesh.sharpness import INFINITE
 from .errors import CageError, CageSource, in_digits, number_of, number_of_such, warn
 
 # Vertices and half-edges of the cage, and of the cage refined once, must fit into 31 bits.

@@ -21,9 +21,8 @@ from ..mesh.one_ring import one_ring
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .irregular_patch import rest_rows
-from .patch_tree import PartKind, PatchTree, patch_tree
+from .patch_tree import PartKind, PatchTree, patch_tree, refined_children
 from .polynomials import polynomial_basis
-from .refined_rings import refined_children
 
 # Number of divisions before a tile is bounded by its pieces and the parts that are still undivided. For surfaces it
 # depends on `Scheme.has_convex_rules`: without convex rules the bound of undivided parts is some ten times looser.

@@ -18,8 +18,7 @@ from .equations import Evaluator, child_rows, times_powers
 from .irregular_patch import IrregularPatch
 from .located_samples import LocatedSamples, by_uv, frame_magnitude, limit_stencils
 from .normals import unit_normals
-from .patch_tree import isolated_signature, patch_tree
-from .refined_rings import refined_children
+from .patch_tree import isolated_signature, patch_tree, refined_children
 
 # Tolerance of `irregular_curvature` when comparing |λ_4| / λ_2² with one. Curvature near an extraordinary point is
 # proportional to the power n of this ratio.

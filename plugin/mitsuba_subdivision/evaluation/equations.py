@@ -1,66 +1,22 @@
 """The equations that evaluate a surface near an extraordinary point: (4), (9), (10), (11), (12) and (13).
 
-The numbers are those of Yasushi Yamaguchi and Mikio Terasawa, "A Method for Basic Evaluations of Subdivision Surfaces",
-Proceedings of the 9th International Conference on Geometry and Graphics (ICGG), 2000.
-
-A patch has its extraordinary point at (u, v) = (0, 0). One refinement divides the patch into four children. Child 0
-holds the extraordinary point and is like the patch itself, at half the size. Children 1, 2 and 3 are regular: the
-surface is a polynomial there. Child 0 is divided in the same way, and so on, until a sample lies in a regular child::
-
-    +---------------+---------------+
-    |               |               |
-    |     n = 0     |     n = 0     |     n   level: refinements of child 0 before the sample
-    |     k = 3     |     k = 2     |         lies in a regular child
-    |               |               |     k   which of the three regular children of that level
-    +-------+-------+---------------+
-    | n = 1 | n = 1 |               |
-    | k = 3 | k = 2 |     n = 0     |
-    +---+---+-------+     k = 1     |
-    |n=2|n=2| n = 1 |               |
-    |...|k=1| k = 1 |               |
-    +---+---+-------+---------------+
-    (0, 0) is the extraordinary point
-
-Symbols; indices begin with 1, those of arrays with 0::
-
-    S           the point of the limit surface at (u, v); S_u, S_v: its derivatives; N: its normal
-    C           the K control points of the patch, in rows
-    A           subdivision matrix, (K, K): A C are the control points of child 0
-    Ā           extended subdivision matrix, (M, K): Ā C are the control points of all four children together
-    P_k         selects the R control points of the regular child k from these M
-    (u', v')    the sample's parameters in its regular child
-    b           the R basis functions of a regular patch, at (u', v'); they sum to one; b_u, b_v: their derivatives
-    s_k         1; for the child in the middle of a triangle -1, because its parameters run backwards
-    V, v_i      eigenvectors of A, the columns of V; v_1 is one everywhere
-    T, λ_i      V⁻¹ A V and the eigenvalues of A on its diagonal, by decreasing modulus; λ_1 = 1
-    ĉ_i         eigen-coordinates: row i of V⁻¹ C, a point for each eigenvector
-
-Powers of A::
+plugin/MATHEMATICS.md has the symbols in section 1 and the derivations in section 5. The extraordinary point of a patch
+is at (u, v) = (0, 0). A sample of level n lies in the regular child k (1, 2 or 3) of the patch that n refinements leave
+around the point, at (u', v'), where the basis functions b are taken. Indices begin with 1, those of arrays with 0::
 
     (4)     S   = bᵀ P_k Ā Aⁿ C
-
-Stam's form: with Aⁿ = V Tⁿ V⁻¹, only powers of eigenvalues depend on the level::
-
     (9)     S   = Σ_{i ≥ 1} (bᵀ P_k Ā v_i) λ_iⁿ ĉ_i
     (11)    S_u = 2ⁿ⁺¹ s_k Σ_{i ≥ 1} (b_uᵀ P_k Ā v_i) λ_iⁿ ĉ_i                        S_v likewise, with b_v
-
-The first term of (11) is zero: v_1 is constant and the derivatives of b sum to zero. In floating point it is not quite
-zero, and 2ⁿ⁺¹ enlarges the rounding error. The stabilised form has no such term::
-
     (10)    S   = ĉ_1 + λ_2ⁿ Σ_{i ≥ 2} (bᵀ P_k Ā v_i) (λ_i / λ_2)ⁿ ĉ_i
     (12)    S_u = (2 λ_2)ⁿ · 2 s_k Σ_{i ≥ 2} (b_uᵀ P_k Ā v_i) (λ_i / λ_2)ⁿ ĉ_i        S_v likewise, with b_v
-
-No ratio exceeds one. The factor (2 λ_2)ⁿ is positive, so normals leave it out. At the extraordinary point itself::
-
     (13)    S(0, 0) = ĉ_1        N(0, 0) = sign(f) (ĉ_2 x ĉ_3) / |ĉ_2 x ĉ_3|
 
-where f is the Jacobian of the characteristic map (u, v) ↦ (bᵀ P_k Ā v_2, bᵀ P_k Ā v_3), at any point. Its sign depends
-on the choice of v_2 and v_3. `irregular_patch` negates v_3 where f is negative, and then leaves the sign out.
-
-Second derivatives have 4ⁿ⁺¹ in place of 2ⁿ⁺¹ s_k, and (4 λ_2)ⁿ · 4 in place of (2 λ_2)ⁿ · 2 s_k.
+s_k is 1, or -1 for the child in the middle of a triangle, because its parameters run backwards. Second derivatives have
+4ⁿ⁺¹ in place of 2ⁿ⁺¹ s_k, and (4 λ_2)ⁿ · 4 in place of (2 λ_2)ⁿ · 2 s_k. The factors (2 λ_2)ⁿ and (4 λ_2)ⁿ are
+positive, so normals leave them out.
 
 The functions below return *rows*: the coefficients of every sample, to be multiplied by C for (4) and by the
-eigen-coordinates for all other equations. `child_rows` computes the products with b, which all forms share;
+eigen-coordinates ĉ for all other equations. `child_rows` computes the products with b, which all forms share;
 `power_rows`, `stam_rows` and `stabilized_rows` continue from there. Some matrices have fewer than K eigenvectors; T
 then has blocks on its diagonal, and `times_powers` multiplies by powers of these blocks.
 """
@@ -185,24 +141,6 @@ def stabilized_rows(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasi
     rows[0] *= (lambda_2**n).take(which)[:, None]
     rows[0, :, 0] = 1
     return rows, np.stack([(2 * lambda_2) ** n, (4 * lambda_2) ** n]).take(which, axis=1)
-
-
-def limit_rows(size: int) -> FloatArray:
-    """Return the rows of (13), ``(3, K)`` over the eigen-coordinates: point ``ĉ_1``, tangents ``ĉ_2`` and ``ĉ_3``.
-
-    Their cross product points along the normal if `characteristic_jacobian` is positive, else against it.
-    """
-    return np.eye(3, size)
-
-
-def characteristic_jacobian(
-    scheme: Scheme,
-    children: FloatArray,  # (3, R, K) float64: `P_k Ā`
-    vectors: FloatArray,  # (K, K) float64: V
-) -> float:
-    """Return f of equation (13) in the middle of the first regular child. Its sign is constant over the patch."""
-    b_u, b_v = scheme.regular_basis(scheme.domain.centre[None], 1)[1:, 0]
-    return float(np.linalg.det(np.stack([b_u, b_v]) @ children[0] @ vectors[:, 1:3]))
 
 
 def distinct_levels(level: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

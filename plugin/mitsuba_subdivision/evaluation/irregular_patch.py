@@ -20,9 +20,7 @@ from .equations import (
     AT_EXTRAORDINARY_POINT,
     Evaluator,
     SampleRows,
-    characteristic_jacobian,
     child_rows,
-    limit_rows,
     power_rows,
     stabilized_rows,
     stam_rows,
@@ -71,7 +69,9 @@ class IrregularPatch:
         except EigenbasisError as error:
             ring = f"a {self.signature.kind} with fans {self.signature.fans}"
             raise SchemeError(f"{self.scheme.name}: subdivision matrix of {ring}: {error}") from error
-        jacobian = characteristic_jacobian(self.scheme, self.children, basis.vectors)
+        # f of equation (13), in the middle of the first regular child. Its sign is constant over the patch.
+        b_u, b_v = self.scheme.regular_basis(self.scheme.domain.centre[None], 1)[1:, 0]
+        jacobian = np.linalg.det(np.stack([b_u, b_v]) @ self.children[0] @ basis.vectors[:, 1:3])
         return basis.turned_over() if jacobian < 0 else basis
 
     @cached_property
@@ -144,7 +144,7 @@ class IrregularPatch:
                     frame[:, at_point] = self.limit_frame[:, None]
         rows[:, at_point], scale[:, at_point] = np.nan, 1
         if evaluator in ("stabilized", "limit"):
-            rows[0, at_point], rows[1:3, at_point] = limit_rows(rows.shape[2])[0], self.edge_tangents[:, None]
+            rows[0, at_point], rows[1:3, at_point] = np.eye(1, rows.shape[2])[0], self.edge_tangents[:, None]
         return SampleRows(rows, scale, np.where(at_point, AT_EXTRAORDINARY_POINT, level), frame)
 
 

@@ -19,7 +19,7 @@ from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .eigenbasis import Eigenbasis
-from .equations import limit_rows, times_powers
+from .equations import times_powers
 
 # Bound of the rounding error of a tangent's coordinate, relative to the sum of its absolute terms, by the number of
 # bits of the type. A cross product within the resulting error counts as zero. In single precision this is the error of
@@ -93,7 +93,7 @@ def limit_frame(scheme: Scheme, signature: Signature, basis: Eigenbasis) -> Floa
     """
     fan, ring, border_faces = signature.fans[0], one_ring(signature), scheme.regular_border_faces
     if fan.is_inside or fan.rule == VertexRule.DART:
-        frame = limit_rows(len(basis.eigenvalues))[1:]
+        frame = np.eye(3, len(basis.eigenvalues))[1:]
         return frame if basis.eigenvalues[2] > 0 else np.zeros_like(frame)
     # Control points are ``C = V ĉ``, so the edge vectors at the point are differences of rows of V.
     first, *_, last = neighbours = ring.edge_neighbours()

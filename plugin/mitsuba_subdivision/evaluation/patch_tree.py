@@ -1,8 +1,9 @@
 """Patch trees: elements divided into regular and self-similar pieces by running the rules of the scheme.
 
-One refinement of an element gives its *children*: four, one for each copy of its domain, or one for the whole domain. A
-*piece* needs no further division: it is a regular patch, or a *tip*, a patch with a single extraordinary point, which
-consists of three regular pieces at every level (`IrregularPatch`).
+One refinement of an element gives its *children*: four, one for each copy of its domain, or one for the whole domain if
+the element does not fit it, such as a corner of a pentagon under Catmull-Clark. A *piece* needs no further division: it
+is a regular patch, or a *tip*, a patch with a single extraordinary point, which consists of three regular pieces at
+every level (`IrregularPatch`).
 
 Refinement along a semi-sharp crease produces thousands of parts, but few kinds of them: parts whose one-rings have the
 same signature are divided alike. So there is one `PatchTree` for each signature, shared by all elements, and its
@@ -12,26 +13,27 @@ parts whose bound is not yet tight (`divided_tile`). Kernels and integrals need 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray, VertexRule
-from ..mesh.one_ring import one_ring
-from ..mesh.sharpness import INFINITE
-from ..mesh.signature import Fan, Signature
+from ..mesh.connectivity import INFINITE, IndexArray, IntArray, VertexRule
+from ..mesh.one_ring import joined_rings, one_ring
+from ..mesh.signature import Fan, Signature, signatures_at
 from ..schemes.domain import IDENTITY, FloatArray, ParameterMap
 from ..schemes.scheme import Scheme, SchemeError
 from .irregular_patch import IrregularPatch
-from .refined_rings import refined_children
 
 # Number of control points of the one-rings that are refined together, which bounds memory to tens of megabytes.
 JOINED_CONTROLS = 1 << 14
+# Tolerance when comparing the sum of a stencil's weights with 1.
+ROW_SUM = 1e-12
 # Maximum depth of a patch tree. Each refinement reduces the sharpness of semi-sharp features, below `INFINITE`, by one.
 # Without them, the schemes of this package need one or two refinements until all elements are pieces. A scheme
 # that needs more than six is refused: its rules keep making new extraordinary points.
@@ -236,6 +238,60 @@ def not_isolated(scheme: Scheme, rest: Signature) -> SchemeError:
         f"{scheme.name}: refinement leaves a {rest.kind} with fans {rest.fans} neither regular nor self-similar; "
         "expected a scheme that isolates extraordinary points"
     )
+
+
+class Child(NamedTuple):
+    """A child of an element."""
+
+    domain: ParameterMap  # From the element's parameters to the child's
+    signature: Signature
+    stencils: FloatArray  # (K_child, K) float64: the child's control points over those of the element
+
+
+def refined_children(scheme: Scheme, signatures: Sequence[Signature]) -> list[list[Child]]:
+    """Return the children of elements of some signatures, whose small one-rings are refined side by side, as one mesh.
+
+    Raises SchemeError if the weights of a control point do not sum to one.
+    """
+    topology, first_half_edges, first_vertices = joined_rings(signatures)
+    refined, table = scheme.refine(topology)
+    parts = [
+        (parent, domain, half_edge)
+        for parent, first in enumerate(first_half_edges.tolist())
+        for domain, half_edge in scheme.children(topology, refined, first)
+    ]
+    half_edges = np.array([half_edge for *_, half_edge in parts])
+    of_parts = signatures_at(refined, half_edges, scheme.element)
+    # Control points of children of equal connectivity are gathered at once.
+    alike: dict[Signature, list[int]] = {}
+    for index, signature in enumerate(of_parts):
+        alike.setdefault(signature.smoothed, []).append(index)
+    controls: dict[int, IndexArray] = {}
+    for signature, indices in alike.items():
+        controls |= zip(indices, one_ring(signature).gather(refined, half_edges[indices]), strict=True)
+
+    # A row for each control point of each child, as long as the one-ring of the parent has vertices.
+    of_children = [controls[index] for index in range(len(parts))]
+    row_counts = [len(of_child) for of_child in of_children]
+    parent_of_row = np.repeat([parent for parent, *_ in parts], row_counts)
+    offsets = ragged.offsets(np.diff(first_vertices)[parent_of_row])
+    rows, columns, weights = table.entries(np.concatenate(of_children))
+    error = np.abs(np.bincount(rows, weights, minlength=len(parent_of_row)) - 1)
+    # `not <=` also refuses NaN.
+    if not error.max() <= ROW_SUM:
+        worst = int(np.argmax(error))
+        smooth, total = signatures[parent_of_row[worst]].smoothed, weights[rows == worst].sum()
+        raise SchemeError(
+            f"{scheme.name}: a refined vertex near a {smooth.kind} with fans {smooth.fans} has "
+            f"weights that sum to {total:.12g}; expected 1"
+        )
+    places = offsets[rows] + columns - first_vertices[parent_of_row[rows]]
+    flat: FloatArray = np.bincount(places, weights, minlength=offsets[-1]).astype(np.float64, copy=False)
+    blocks = np.split(flat, offsets[np.cumsum(row_counts)[:-1]])
+    children: list[list[Child]] = [[] for _ in signatures]
+    for (parent, domain, _), signature, count, block in zip(parts, of_parts, row_counts, blocks, strict=True):
+        children[parent].append(Child(domain, signature, block.reshape(count, -1)))
+    return children
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,14 @@ from ..mesh.signature import Fan, Signature
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme, SchemeError
 from .located_samples import LocatedSamples
-from .patch_tree import irregular_patch, isolated_signature, lattice_stencils, patch_tree, regular_signature
-from .refined_rings import refined_children
+from .patch_tree import (
+    irregular_patch,
+    isolated_signature,
+    lattice_stencils,
+    patch_tree,
+    refined_children,
+    regular_signature,
+)
 
 # Valences, and numbers of corners, with which a scheme is tested if it supports them.
 VALENCES, SIZES = range(3, 9), (3, 4, 5)

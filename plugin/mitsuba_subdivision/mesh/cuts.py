@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import ragged
-from .connectivity import IntArray, Topology, VertexRule
+from .connectivity import INFINITE, CreaseMethod, FloatArray, IntArray, SemiSharpness, Topology, VertexRule
 from .manifold import NonManifold, fan_labels
 from .shared import Content, Shared
-from .sharpness import INFINITE, CreaseMethod, FloatArray, SemiSharpness
 
 # Modes in which one of two values at a vertex may make the other a corner, or sharpen it by its semi-sharp edges.
 _CORNERS_PLUS = ("corners_plus1", "corners_plus2")

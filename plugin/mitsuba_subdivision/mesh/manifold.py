@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .connectivity import IntArray, Topology
+from .ragged import sorted_order
 
 # Maximum number of corners of faces that are checked without sorting.
 FEW_CORNERS = 8
@@ -75,9 +76,9 @@ def is_repeated(topology: Topology) -> NDArray[np.bool_]:
 
 def is_later(keys: IntArray) -> NDArray[np.bool_]:
     """Return whether an equal key precedes each key."""
-    order = np.argsort(keys, kind="stable")
-    later = np.zeros(len(keys), dtype=bool)
-    later[order[1:]] = keys[order[1:]] == keys[order[:-1]]
+    order, is_new = sorted_order(keys)
+    later = np.empty(len(keys), dtype=bool)
+    later[order] = ~is_new
     return later
 
 

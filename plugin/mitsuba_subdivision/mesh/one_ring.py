@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import ragged
-from .connectivity import IndexArray, IntArray, Topology
-from .sharpness import SemiSharpness
+from .connectivity import IndexArray, IntArray, SemiSharpness, Topology
 from .signature import NEAR_FACES, Fan, Signature
 
 # Steps from one half-edge to another: to the next one of its face, and to its twin.

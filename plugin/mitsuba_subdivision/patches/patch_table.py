@@ -61,33 +61,23 @@ class PatchTable:
         may_turn: bool = True,
     ) -> None:
         self.topology, self.scheme, self.is_hole, self.may_turn = topology, scheme, is_hole, may_turn
-
-    @property
-    def elements(self) -> Topology:
-        """The mesh whose faces are the elements: the cage's mesh, or its dual, whose vertices are the cage's faces.
-
-        A face of the dual begins at the lowest half-edge of its vertex. Holes and border vertices, which are no
-        elements, become faces without corners.
-        """
-        return self._elements[0]
-
-    @property
-    def half_edge_of_corner(self) -> IndexArray:
-        """``(n_h,)`` the half-edge of the mesh that corresponds to each half-edge of `elements`."""
-        return self._elements[1]
-
-    @cached_property
-    def _elements(self) -> tuple[Topology, IndexArray]:
-        t = self.topology
-        if self.scheme.element == "vertex":
+        # The mesh whose faces are the elements: the cage's mesh, or its dual, whose vertices are the cage's faces. A
+        # face of the dual begins at the lowest half-edge of its vertex. Holes and border vertices, which are no
+        # elements, become faces without corners.
+        self.elements = topology
+        # (n_h,) the half-edge of the mesh that corresponds to each half-edge of `elements`
+        self.half_edge_of_corner: IndexArray = np.arange(topology.half_edge_count, dtype=np.int32)
+        t = topology
+        if scheme.element == "vertex":
             offsets, half_edges = t.vertex_fans
             # A dual edge crosses the cage's edge that two successive faces about a vertex share.
-            return Topology(t.face_count, np.diff(offsets), t.face[half_edges], t.edge[t.prev[half_edges]]), half_edges
-        if self.is_hole is None or not self.is_hole.any():
-            return t, np.arange(t.half_edge_count, dtype=np.int32)
-        kept = t.half_edges_of(~self.is_hole).astype(np.int32)
-        sizes = np.where(self.is_hole, 0, t.face_sizes)
-        return Topology(t.vertex_count, sizes, t.face_vertices[kept], t.edge[kept]), kept
+            self.elements = Topology(t.face_count, np.diff(offsets), t.face[half_edges], t.edge[t.prev[half_edges]])
+            self.half_edge_of_corner = half_edges
+        elif is_hole is not None and is_hole.any():
+            kept = t.half_edges_of(~is_hole).astype(np.int32)
+            sizes = np.where(is_hole, 0, t.face_sizes)
+            self.elements = Topology(t.vertex_count, sizes, t.face_vertices[kept], t.edge[kept])
+            self.half_edge_of_corner = kept
 
     @cached_property
     def is_whole(self) -> NDArray[np.bool_]:

@@ -17,9 +17,8 @@ from ..cage.contents import RULES, CageContents
 from ..cage.control_cage import ControlCage
 from ..cage.errors import CageError, CageSource, without_warnings
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray, VertexRule
+from ..mesh.connectivity import INFINITE, IntArray, VertexRule
 from ..mesh.cuts import Sharpness
-from ..mesh.sharpness import INFINITE
 from ..schemes import Scheme, SchemeError
 from ..schemes.scheme import Refinement
 from .adapted_scheme import adapted_scheme

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..mesh import ragged
-from ..mesh.connectivity import Topology
-from ..mesh.sharpness import CreaseMethod
+from ..mesh.connectivity import CreaseMethod, Topology
 from ..mesh.signature import ElementKind
 from .crease_masks import crease_masks, kept_sharpness
 from .domain import IDENTITY, SQUARE, FloatArray, ParameterMap

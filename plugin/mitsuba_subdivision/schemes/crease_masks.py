@@ -25,8 +25,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh.connectivity import IntArray, Topology, VertexRule
-from ..mesh.sharpness import CreaseMethod, SemiSharpness
+from ..mesh.connectivity import CreaseMethod, IntArray, SemiSharpness, Topology, VertexRule
 from .domain import FloatArray
 
 # Weight of each of the two neighbours in the crease mask.

@@ -7,8 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh.connectivity import IntArray, Topology
-from ..mesh.sharpness import CreaseMethod
+from ..mesh.connectivity import CreaseMethod, IntArray, Topology
 from ..mesh.signature import ElementKind
 from .crease_masks import crease_masks, kept_sharpness
 from .domain import TRIANGLE, FloatArray, ParameterMap

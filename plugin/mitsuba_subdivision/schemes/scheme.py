@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray, Topology
-from ..mesh.sharpness import CreaseMethod
+from ..mesh.connectivity import CreaseMethod, IntArray, Topology
 from ..mesh.signature import ElementKind
 from .domain import FloatArray, ParameterDomain, ParameterMap
 

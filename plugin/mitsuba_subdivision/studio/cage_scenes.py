@@ -5,7 +5,6 @@ from __future__ import annotations
 import pickle
 import re
 import tempfile
-import warnings
 import weakref
 from collections.abc import Iterator, Sequence
 from functools import cached_property
@@ -17,9 +16,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage import CageError, CageWarning, ControlCage, named_cages
-from ..cage.contents import CageContents, same_topology
-from ..cage.errors import CageSource, shortened, warn
+from ..cage import CageError, ControlCage, named_cages
+from ..cage.contents import same_topology
+from ..cage.errors import CageSource, noting_warnings, shortened, warn, without_warnings
 from ..files.formats import FORMATS, read_file
 from ..files.usd_stage import stage_up_axis
 from ..regression.scene import LoadedScene
@@ -157,7 +156,7 @@ class CageScenes:
     """Scene source of one cage in the studio: its contents at a time, and scenes of these.
 
     Where frames have the same topology, the shape that is loaded gets other control points; its patches and weights
-    stay. Each file is read once: its contents are kept in a temporary file.
+    stay. Each file is read once: contents of frames are kept in temporary files.
     Raises CageError, OSError if there is no file of a frame.
     """
 
@@ -183,42 +182,32 @@ class CageScenes:
         self._files = None if numbers is None else FrameFiles(Path(str(cage)), numbers)
         # Contents and model of the first frame that is read.
         self._first: Any = None
-        self._kept = tempfile.TemporaryFile()  # noqa: SIM115 - it is closed with the object
-        weakref.finalize(self, self._kept.close)
-        self._offsets: dict[int, int] = {}
+        self._kept = tempfile.TemporaryDirectory()
+        weakref.finalize(self, self._kept.cleanup)
 
     def at(self, number: int | None = None) -> PosedModel:
         """The cage of a frame; by default, of the file or in memory."""
         if isinstance(self._cage, ControlCage):
             model = Model(self._cage, scheme=self._scheme)
             return model, model.cage.positions
-        is_kept = number in self._offsets
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", CageWarning)
-            contents, path, time = self._contents(Path(self._cage), number)
+        path, time = Path(self._cage), self._time
+        if self._files is not None and number is not None:
+            path, time = self._files.file(number), self._files.time(number)
+        kept = Path(self._kept.name, str(number))
+        is_kept = kept.exists()
+        with without_warnings(), noting_warnings() as noted:
+            contents = pickle.loads(kept.read_bytes()) if is_kept else read_file(path, self._prim, time, self._rules)
+            if number is not None and not is_kept:
+                kept.write_bytes(pickle.dumps(contents))
             if self._first is not None and same_topology(contents, self._first[0]):
                 # Frames of the same topology have the same warnings.
                 return self._first[1], np.asarray(contents.positions, dtype=np.float64)
             cage = ControlCage.from_arrays(**{**contents.as_arguments(), **self._rules})
             model = Model(cage, path, prim=self._prim, time=time, scheme=self._scheme)
-        for warning in () if is_kept else caught:
-            warn(str(warning.message))
+        for message in () if is_kept else noted:
+            warn(message)
         self._first = self._first or (contents, model)
         return model, cage.positions
-
-    def _contents(self, path: Path, number: int | None) -> tuple[CageContents, Path, float | None]:
-        """Contents of the file of a frame, which are kept when they are read; the file, and the time in it."""
-        time = self._time
-        if self._files is None or number is None:
-            return read_file(path, self._prim, time, self._rules), path, time
-        path, time = self._files.file(number), self._files.time(number)
-        if number in self._offsets:
-            self._kept.seek(self._offsets[number])
-            return pickle.load(self._kept), path, time
-        contents = read_file(path, self._prim, time, self._rules)
-        self._offsets[number] = self._kept.seek(0, 2)
-        pickle.dump(contents, self._kept)
-        return contents, path, time
 
     def framing(self, contents: PosedModel) -> tuple[str, View, tuple[int, int]]:
         """Axis that points up, view and size of the picture."""
