@@ -63,18 +63,19 @@ def test_options_of_mitsubas_own_program(folder):
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="a process cannot be kept to one core here")
-@pytest.mark.parametrize("options", [[], ["--passes", "2"]], ids=["picture", "passes"])
-def test_one_core_reads_and_writes_openexr(folder, options):
+def test_one_core_reads_and_writes_openexr(folder):
+    """A picture, and passes."""
     mi.Bitmap(np.full((16, 32, 3), 0.5, np.float32)).write(str(folder / "sky.exr"))
     sky = '<emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>'
     (folder / "sky.xml").write_text(SCENE.format(sky + SENSOR.format(4)))
-    command = ["render", "sky.xml", "-o", "a.exr", "-m", "scalar_rgb", "--spp", "2", "-t", "1", *options]
-    core = min(os.sched_getaffinity(0))
-    start = "from mitsuba_subdivision.__main__ import main; raise SystemExit(main())"
-    run = [sys.executable, "-c", f"import os; os.sched_setaffinity(0, {{{core}}}); {start}", *command]
+    code = f"""import os; os.sched_setaffinity(0, {{{min(os.sched_getaffinity(0))}}})
+from mitsuba_subdivision.__main__ import main
+words = "render sky.xml -m scalar_rgb --spp 2 -t 1 -o".split()
+raise SystemExit(main([*words, "a.exr"]) or main([*words, "b.exr", "--passes", "2"]))"""
     # Where all wait for a thread that there is not, they wait for ever.
-    subprocess.run(run, check=True, capture_output=True, timeout=60)
-    np.testing.assert_allclose(pixels("a.exr")[..., :3], 0.5, rtol=1e-3)
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
+    for name in ("a.exr", "b.exr"):
+        np.testing.assert_allclose(pixels(name)[..., :3], 0.5, rtol=1e-3)
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")
@@ -122,9 +123,8 @@ def moving_cages(folder):
         (moved.refined() if number == 3 else moved).save(folder / f"f_{number:02d}.obj")
 
 
-@pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
-def test_frames_are_what_each_file_gives_alone(folder, variant, request):
-    request.getfixturevalue(f"variant_{variant}")
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_frames_are_what_each_file_gives_alone(folder):
     moving_cages(folder)
     look = Look(size=(20, 15), spp=16, rate=2, up="z", cage=True)
     moving = frame_range(folder / "f_%02d.obj", look, range(1, 4))
@@ -170,11 +170,9 @@ def test_times_of_a_usd_file_are_frames(folder):
         int[] faceVertexCounts = {cage.face_sizes.tolist()}
         int[] faceVertexIndices = {cage.face_vertices.tolist()}"""
     (folder / "m.usda").write_text(f'#usda 1.0\ndef Mesh "m" {{\n{lines}\n}}\n')
-    look = Look(size=(20, 15), spp=4, rate=2)
-    moving = frame_range(folder / "m.usda", look, range(1, 6, 2))
+    moving = frame_range(folder / "m.usda", Look(size=(20, 15), spp=4, rate=2), range(1, 6, 2))
     points = (mi.traverse(loaded.scene)["surface.control_points"] for loaded in moving.frames([1, 3, 5], None))
-    sizes = [np.abs(np.array(values)).max() for values in points]
-    np.testing.assert_allclose(sizes, [1, 3, 5], rtol=1e-6)
+    np.testing.assert_allclose([np.abs(np.array(values)).max() for values in points], [1, 3, 5], rtol=1e-6)
     assert render("m.usda", "-o", "m.png", "--frames", "1:5:4", *SMALL) == 0
     assert {path.name for path in folder.glob("m_*.png")} == {"m_0001.png", "m_0005.png"}
     assert render("m.usda", "-o", "m.png", "--prim", "/none", *SMALL) == 1
