@@ -403,35 +403,21 @@ def test_lights_and_cameras_that_cannot_be_used(scene):
     for bad in ("token inputs:width = 'x'", "float inputs:width = 0", "float inputs:intensity = inf"):
         with pytest.warns(CageWarning, match="prim /lamp: .*; expected .*; the prim is left out"):
             assert "lamp" not in scene(cube + light("RectLight", bad))
-    for bad in (0, "nan"):
+    for view in ({"focal_length": 0}, {"focal_length": "nan"}):
         with pytest.raises(CageError, match="prim /camera: the camera is not usable; expected finite numbers, and"):
-            scene(cube + camera(focal_length=bad))
+            scene(cube + camera(**view))
+    with pytest.raises(CageError, match='there is no camera "/none"; expected one of those there are: /camera'):
+        scene(cube + camera(), camera="/none")
 
 
-def test_inputs_of_preview_surfaces(scene):
-    def painted(*inputs):
-        return scene(material("\n".join(inputs)) + mesh("cube", CUBE, bound()))
-
-    numbers = {"metallic": 0.4, "roughness": 0.6, "ior": 0.5, "clearcoat": 0.7, "clearcoatRoughness": 0.2}
-    inputs = [f"float inputs:{name} = {value}" for name, value in {**numbers, "opacity": 0.8}.items()]
-    inputs += ["color3f inputs:diffuseColor = (0.1, 0.2, 0.3)", 'token inputs:opacityMode = "presence"']
-    mask = painted(*inputs)["paint"]
-    assert (mask["type"], mask["opacity"], mask["bsdf"]["type"]) == ("mask", pytest.approx(0.8), "twosided")
-    bsdf = mask["bsdf"]["bsdf"]
-    # The coat reflects 0.04.
-    np.testing.assert_allclose(bsdf["base_color"]["value"], np.array([0.1, 0.2, 0.3]) * (1 - 0.7 * 0.04), rtol=1e-6)
-    # Reflections are the same from the inside.
-    expected = {"metallic": 0.4, "roughness": 0.6, "eta": 2.0, "clearcoat": 0.7, "clearcoat_gloss": 0.06 / 0.099}
-    assert {name: bsdf[name] for name in expected} == pytest.approx(expected, rel=1e-5)
-    assert painted("float inputs:opacity = 0.4", "float inputs:opacityThreshold = 0.5")["paint"]["opacity"] == 0
-    glow = painted("color3f inputs:emissiveColor = (1, 2, 3)")
-    assert glow["cube"]["emitter"] == {"type": "area", "radiance": {"type": "rgb", "value": [1, 2, 3]}}
-    # A light is one of UsdLux.
-    assert "key_light" in glow
+def test_surfaces_that_emit_light_are_no_lamps(scene):
+    """A lamp is one of UsdLux, without which there is the studio's."""
+    glow = scene(material("color3f inputs:emissiveColor = (1, 2, 3)") + mesh("cube", CUBE, bound()))
     apis = ["MeshLightAPI", "MaterialBindingAPI"]
-    shining = scene(prim("Mesh", "cube", CUBE, "float inputs:intensity = 2", apis=apis))
-    assert shining["cube"]["emitter"] == {"type": "area", "radiance": {"type": "rgb", "value": [2, 2, 2]}}
-    assert "key_light" not in shining
+    lamp = scene(prim("Mesh", "cube", CUBE, "float inputs:intensity = 2", apis=apis))
+    for entries, value in ((glow, [1, 2, 3]), (lamp, [2, 2, 2])):
+        assert entries["cube"]["emitter"] == {"type": "area", "radiance": {"type": "rgb", "value": value}}
+    assert ["key_light" in entries for entries in (glow, lamp)] == [True, False]
 
 
 QUADRANTS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], dtype=np.uint8)
@@ -763,29 +749,23 @@ def test_what_lights_cannot_do_is_told(scene, kind, schema, attribute, is_told):
     assert bool(re.search(pattern, " ".join(messages))) == is_told
 
 
-@pytest.mark.parametrize("other", ["DistantLight", "SphereLight", "RectLight", "DomeLight"])
-def test_lamps_cast_no_shadows(scene, other):
-    """Light of another lamp shines through them; both add up in the middle of a plane."""
-    lamp = light("SphereLight", radius=0.5, intensity=5, place=(0, 0, 2))
-    kinds = [] if other == "DomeLight" else [NORMALIZED, POINT] if other == "SphereLight" else [NORMALIZED]
-    behind = light(other, *kinds, intensity=10 if kinds else 1, place=(0, 0, 6), name="behind")
-    one, two, both = (middle_of_square(scene, lights, 1.4) for lights in (lamp, behind, lamp + behind))
+BEHIND = {
+    "DomeLight": light("DomeLight", name="behind"),
+    "DistantLight": light("DistantLight", NORMALIZED, intensity=10, name="behind"),
+    "SphereLight": light("SphereLight", NORMALIZED, POINT, intensity=10, place=(0, 0, 6), name="behind"),
+    "RectLight": light("RectLight", NORMALIZED, intensity=10, place=(0, 0, 6), name="behind"),
+}
+IN_THE_WAY = [(kind, (0, 0, 2), "path" if kind == "DomeLight" else "volpath", {"type": "null"}) for kind in BEHIND]
+
+
+@pytest.mark.parametrize(("kind", "place", "integrator", "bsdf"), [*IN_THE_WAY, ("RectLight", (5, 0, 6), "path", None)])
+def test_lamps_cast_no_shadows(scene, kind, place, integrator, bsdf):
+    """Light of other lamps shines through them, by the volumetric path tracer, which is slower; all of it adds up."""
+    lamp = light("SphereLight", radius=0.5, intensity=5, place=place)
+    one, two, both = (middle_of_square(scene, lights, 1.4) for lights in (lamp, BEHIND[kind], lamp + BEHIND[kind]))
     assert both == pytest.approx(one + two, rel=LAMPS_NOISE)
     assert min(one, two) > 2 * LAMPS_NOISE * both
-
-
-@pytest.mark.parametrize(
-    ("place", "other", "integrator", "bsdf"),
-    [
-        ((0, 0, 4), DARK, "path", {"type": "null"}),
-        ((0, 0, 2), light("RectLight", place=(0, 0, 6), name="other"), "volpath", {"type": "null"}),
-        ((5, 0, 6), light("RectLight", place=(0, 0, 6), name="other"), "path", None),
-    ],
-    ids=["below a uniform dome", "between", "beside"],
-)
-def test_lamps_are_clear_where_they_are_in_the_way_of_other_lights(scene, place, other, integrator, bsdf):
-    """The volumetric path tracer, which is slower, is used only for lamps through which lamps shine."""
-    entries = scene(CAMERA + light("SphereLight", radius=0.5, place=place) + other + mesh("square", SQUARE))
+    entries = scene(CAMERA + lamp + BEHIND[kind] + mesh("square", SQUARE))
     assert (entries["integrator"]["type"], entries["lamp"].get("bsdf")) == (integrator, bsdf)
 
 
@@ -869,8 +849,17 @@ def test_depth_of_field_and_the_resolution_of_render_settings(scene):
     # Focal lengths are in tenths of the world's unit.
     assert (sensor["type"], sensor["aperture_radius"], sensor["focus_distance"]) == ("thinlens", 1.25, 7)
     assert (sensor["film"]["width"], sensor["film"]["height"]) == (40, 20)
-    with pytest.raises(CageError, match='there is no camera "/none"; expected one of those there are: /camera'):
-        scene(view, camera="/none")
+
+
+@pytest.mark.parametrize("name", ["disableMotionBlur", "instantaneousShutter", "disableDepthOfField"])
+def test_render_settings_turn_off_blur(stage, name):
+    shutter = "double shutter:open = -0.5\ndouble shutter:close = 0.5\n"
+    view = camera("float fStop = 2", "float focusDistance = 7", shutter) + mesh("cube", CUBE)
+    blurs = name == "disableDepthOfField"
+    for value, is_off in (("false", [False, False]), ("true", [not blurs, blurs])):
+        text = settings(RESOLUTION, f"uniform bool {name} = {value}") + view
+        lens = StageReader(stage(text, head=NAMED)).at().camera
+        assert [lens.shutter == [0, 0], lens.lens_radius == 0] == is_off
 
 
 @pytest.mark.parametrize("projection", ["perspective", "orthographic"])
@@ -897,17 +886,6 @@ def test_the_aperture_fits_the_picture_as_render_settings_say(scene, projection,
     rays = [sensor.sample_ray(0, 0, mi.Point2f(corner), mi.Point2f(0.5))[0] for corner in (0, 1)]
     ends = [np.array(ray.d * 50 / -ray.d.z if projection == "perspective" else ray.o * 10)[:2] for ray in rays]
     np.testing.assert_allclose(np.abs(np.subtract(*ends)), [wide, high], rtol=1e-5)
-
-
-@pytest.mark.parametrize("name", ["disableMotionBlur", "instantaneousShutter", "disableDepthOfField"])
-def test_render_settings_turn_off_blur(stage, name):
-    shutter = "double shutter:open = -0.5\ndouble shutter:close = 0.5\n"
-    view = camera("float fStop = 2", "float focusDistance = 7", shutter) + mesh("cube", CUBE)
-    blurs = name == "disableDepthOfField"
-    for value, is_off in (("false", [False, False]), ("true", [not blurs, blurs])):
-        text = settings(RESOLUTION, f"uniform bool {name} = {value}") + view
-        lens = StageReader(stage(text, head=NAMED)).at().camera
-        assert [lens.shutter == [0, 0], lens.lens_radius == 0] == is_off
 
 
 OTHER_SETTINGS = ["float pixelAspectRatio = 2", "float4 dataWindowNDC = (0, 0, 0.5, 1)"]
