@@ -8,9 +8,10 @@ import pytest
 from mitsuba_usd import textures
 from mitsuba_usd.contents import NodeContents, TextureContents, leaves
 from mitsuba_usd.materialx_nodes import evaluate, node, operation
-from mitsuba_usd.textures import _procedural_wrap, baked
+from mitsuba_usd.textures import baked
 
 UV = NodeContents("texcoord", "vector2", {"name": "st"})
+RAMP = node("ramplr", "float", valuel=1.0, valuer=3.0, texcoord=UV)
 
 
 def picture(channel="rgb", name="a.png", to_uv=((1, 0, 0), (0, 1, 0), (0, 0, 1))):
@@ -86,28 +87,22 @@ def test_a_node_of_a_picture_has_its_values_whether_or_not_it_stays_a_picture(ca
         np.testing.assert_allclose(missing[0], expected[-1], rtol=1e-4, atol=1e-4)
 
 
-def test_operations_take_arrays_of_points():
-    wide = np.random.default_rng(1).random((2, 3, 3))
-    varying = {"add": "in1", "mix": "fg", "difference": "bg", "ifgreater": "in2", "hsvtorgb": "in"}
-    for category, name in varying.items():
-        given = dict.fromkeys(("in1", "in2", "bg", "fg", "mix", "value1", "value2"), np.array([0.3]))
-        assert operation(category, "color3", {**given, name: wide}).shape == (2, 3, 3)
-    grey = wide[..., :1]
-    np.testing.assert_array_equal(operation("convert", "color3", {"in": grey}), np.repeat(grey, 3, axis=-1))
-    parts = {"in1": grey, "in2": np.array([0.3]), "in3": wide[..., 1:2]}
-    joined = np.stack([wide[..., 0], np.full((2, 3), 0.3), wide[..., 1]], axis=-1)
-    np.testing.assert_array_equal(operation("combine3", "vector3", parts), joined)
-
-
 @pytest.mark.core
-def test_ramps_and_splits_lie_as_the_specification_says():
+def test_ramps_and_splits_lie_as_the_specification_says(monkeypatch):
+    """They end at the unit square, and repeat where there is noise."""
     points = np.array([[0.25, 0.75], [1.5, -1]])
     for pattern, expected in (
-        (node("ramplr", "float", valuel=1.0, valuer=3.0, texcoord=UV), [1.5, 3]),
+        (RAMP, [1.5, 3]),
         (node("ramptb", "float", valuet=1.0, valueb=3.0, texcoord=UV), [1.5, 3]),
         (node("splittb", "float", valuet=1.0, valueb=3.0, center=0.5, texcoord=UV), [1, 3]),
     ):
         np.testing.assert_allclose(evaluate(pattern, points)[..., 0], expected)
+    monkeypatch.setattr(textures, "LEAST_PROCEDURAL", 4)
+    assert baked(RAMP, None)[2] == "clamp"
+    given = {"amplitude": 1.0, "pivot": 0.0, "octaves": 3.0, "lacunarity": 2.0, "diminish": 0.5, "texcoord": UV}
+    for noise in ("noise2d", "fractal2d", "cellnoise2d"):
+        noisy = node("add", "float", in1=RAMP, in2=node(noise, "float", **given))
+        assert baked(noisy, None)[2] == "repeat"
 
 
 def _hash(*words):
@@ -138,25 +133,23 @@ def _perlin(x, y):
 
 def test_noises_are_those_of_open_shading_language():
     points = np.random.default_rng(2).uniform(-20, 20, (50, 2))
-    noise = evaluate(node("noise2d", "float", amplitude=2.0, pivot=0.5, texcoord=UV), points)
-    np.testing.assert_allclose(noise[..., 0], [2 * _perlin(*p) + 0.5 for p in points], atol=1e-12)
-    fractal = node("fractal2d", "float", amplitude=1.0, octaves=3.0, lacunarity=2.0, diminish=0.5, texcoord=UV)
+
+    def values(category, **inputs):
+        return evaluate(node(category, "float", texcoord=UV, **inputs), points)[..., 0]
+
+    expected = [2 * _perlin(*p) + 0.5 for p in points]
+    np.testing.assert_allclose(values("noise2d", amplitude=2.0, pivot=0.5), expected, atol=1e-12)
     expected = [sum(0.5**k * _perlin(*(p * 2**k)) for k in range(3)) for p in points]
-    np.testing.assert_allclose(evaluate(fractal, points)[..., 0], expected, atol=1e-12)
-    cells = evaluate(node("cellnoise2d", "float", texcoord=UV), points)[..., 0]
+    fractal = values("fractal2d", amplitude=1.0, octaves=3.0, lacunarity=2.0, diminish=0.5)
+    np.testing.assert_allclose(fractal, expected, atol=1e-12)
     expected = [_hash(*(math.floor(x) & 0xFFFFFFFF for x in p)) / 0xFFFFFFFF for p in points]
-    np.testing.assert_allclose(cells, expected, atol=1e-12)
+    np.testing.assert_allclose(values("cellnoise2d"), expected, atol=1e-12)
+    # Without jitter, the points of cells are the centres of the unit squares.
+    expected = np.linalg.norm(points - np.floor(points) - 0.5, axis=1)
+    np.testing.assert_allclose(values("worleynoise2d", jitter=0.0, style=0.0), expected, atol=1e-12)
     wide = evaluate(node("noise2d", "vector3", amplitude=[1.0] * 3, pivot=0.0, texcoord=UV), points)
     assert wide.shape == (50, 3)
     assert np.abs(np.corrcoef(wide.T) - np.eye(3)).max() < 0.5
-
-
-def test_distances_of_worley_noise_are_to_the_nearest_of_random_points():
-    """Without jitter, the points are the centres of the unit squares."""
-    points = np.random.default_rng(3).uniform(-5, 5, (40, 2))
-    given = {"texcoord": UV, "jitter": 0.0, "style": 0.0}
-    distances = evaluate(node("worleynoise2d", "float", **given), points)[..., 0]
-    np.testing.assert_allclose(distances, np.linalg.norm(points - np.floor(points) - 0.5, axis=1), atol=1e-12)
 
 
 def test_a_picture_times_a_colour_stays_a_picture():
@@ -212,21 +205,17 @@ def test_what_lies_in_several_places_is_computed_over_the_unit_square(monkeypatc
 
 
 def test_heights_become_normals(monkeypatch):
-    """A plane of slope 1 along u: the scale of the filter is 1 / 16."""
+    """A plane of slope 1 along u: the scale of the filter is 1 / 16. A picture that is repeated is steeper."""
     monkeypatch.setattr(textures, "LEAST_PROCEDURAL", 64)
     height = np.broadcast_to((np.arange(64) + 0.5) / 64, (64, 64))[..., None]
-    for repeats in (1, 2):
-        # A picture that is repeated is steeper.
-        tiled = picture("r", to_uv=np.diag([repeats, 1.0, 1.0]))
-        expression = NodeContents("heighttonormal", "vector3", {"in": tiled, "scale": 16.0})
-        normals = baked(expression, source({"a.png": height}))[0]
-        expected = np.array([-repeats, 0, 1]) / np.sqrt(1 + repeats**2)
-        np.testing.assert_allclose(normals[32, 32] * 2 - 1, expected, atol=1e-3)
     one = node("ramplr", "float", valuel=1.0, valuer=1.0, texcoord=UV)
+    twice = picture("r", to_uv=np.diag([2, 1.0, 1.0]))
     varying = node("multiply", "float", in1=picture("r"), in2=one)
-    expression = NodeContents("heighttonormal", "vector3", {"in": varying, "scale": 16.0})
-    normals = baked(expression, source({"a.png": height}))[0]
-    np.testing.assert_allclose(normals[32, 32] * 2 - 1, np.array([-1, 0, 1]) / np.sqrt(2), atol=1e-3)
+    for heights, slope in ((picture("r"), 1), (twice, 2), (varying, 1)):
+        expression = NodeContents("heighttonormal", "vector3", {"in": heights, "scale": 16.0})
+        normals = baked(expression, source({"a.png": height}))[0]
+        expected = np.array([-slope, 0, 1]) / np.hypot(slope, 1)
+        np.testing.assert_allclose(normals[32, 32] * 2 - 1, expected, atol=1e-3)
 
 
 def test_lookups_of_a_linear_image_are_linear_and_continue_beyond_it(np_rng):
@@ -242,11 +231,3 @@ def test_lookups_of_a_linear_image_are_linear_and_continue_beyond_it(np_rng):
         at_once = textures._looked_up(values, np.stack([uv, beyond]), wrap)
         np.testing.assert_allclose(at_once[0], at_once[1], rtol=0, atol=1e-5)
     np.testing.assert_allclose(textures._looked_up(values, np.array([5.0, -3.0]), "clamp"), [[24]], rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("noise", ["noise2d", "fractal2d", "cellnoise2d"])
-def test_ramps_end_at_the_unit_square_and_repeat_where_there_is_noise(noise):
-    ramp = node("ramplr", "float", valuel=0.0, valuer=1.0, texcoord=UV)
-    pattern = node(noise, "float", texcoord=UV)
-    assert _procedural_wrap(ramp) == "clamp"
-    assert _procedural_wrap(node("add", "float", in1=ramp, in2=pattern)) == "repeat"

@@ -138,20 +138,6 @@ def test_edges_of_metals_turn_to_white_as_slowly_as_schlick_has_it(model, color)
         np.testing.assert_allclose(reflected, expected, atol=0.025)
 
 
-def test_edge_colours_below_a_coat_are_only_missed_where_they_are_not_white():
-    given = {"base_metalness": 1.0, "base_color": COPPER, "coat_weight": 1.0}
-    for color, is_missed in (([1.0, 1.0, 1.0], False), ([0.6, 0.6, 0.6], True)):
-        _, notes = entry(look("open_pbr_surface", specular_color=color, **given))
-        assert any("edge colours" in message for message in told(notes.warn, "stage")[1]) == is_missed
-
-
-def test_fresnel_equations_of_conductors_are_those_of_dielectrics_without_absorption():
-    cosine, eta = 0.6, 1.5
-    inner = np.sqrt(1 - (1 - cosine**2) / eta**2)
-    across, along = (cosine - eta * inner) / (cosine + eta * inner), (eta * cosine - inner) / (eta * cosine + inner)
-    np.testing.assert_allclose(conductor_reflectance(eta, 0.0, cosine), (across**2 + along**2) / 2, rtol=1e-12)
-
-
 GLASSES = [
     ("standard_surface", {"transmission": 1.0, "transmission_color": COLOR, "specular_roughness": 0.0}),
     ("open_pbr_surface", {"transmission_weight": 1.0, "transmission_color": COLOR, "specular_roughness": 0.0}),
@@ -244,6 +230,7 @@ OPEN_WIDTH = 0.25 * np.sqrt(2 / (1 + 0.5**2))
         # Of Standard Surface: widths are r^2 / sqrt(1 - a) and r^2 sqrt(1 - a); the others have others.
         ("standard_surface", ROUGH_METAL, (0.5, 0.125)),
         ("standard_surface", {**ROUGH_METAL, "specular_rotation": 0.25}, (0.125, 0.5)),
+        ("standard_surface", {**ROUGH_METAL, "specular_rotation": 0.1}, (0.5, 0.125)),
         ("open_pbr_surface", OPEN_METAL, (OPEN_WIDTH, OPEN_WIDTH / 2)),
         ("gltf_pbr", {**GLTF_METAL, "anisotropy_strength": 0.5}, (0.25 + 0.75 * 0.25, 0.25)),
         ("gltf_pbr", {**GLTF_METAL, "anisotropy_strength": 1.0}, (1, 0.25)),
@@ -252,15 +239,25 @@ OPEN_WIDTH = 0.25 * np.sqrt(2 / (1 + 0.5**2))
 def test_anisotropy_is_the_ratio_of_widths_and_turns_by_quarters(model, given, widths):
     bsdf = bsdf_of(model, **given)
     assert (bsdf["alpha_u"], bsdf["alpha_v"]) == pytest.approx(widths)
-
-
-def test_other_rotations_of_anisotropy_are_rounded_and_told():
-    skew, notes = entry(look("standard_surface", metalness=1.0, specular_anisotropy=0.5, specular_rotation=0.1))
-    assert skew["bsdf"]["alpha_u"] > skew["bsdf"]["alpha_v"]
-    with pytest.warns(UserWarning, match="rounded to quarter turns"):
-        notes.warn("file")
     # Of principled, the widths are r^2 / sqrt(1 - 0.9 a) and r^2 sqrt(1 - 0.9 a).
     assert bsdf_of("standard_surface", specular_anisotropy=0.45)["anisotropic"] == pytest.approx(0.5)
+
+
+COATED = {"base_metalness": 1.0, "base_color": COPPER, "coat_weight": 1.0}
+TURNED = {"metalness": 1.0, "specular_anisotropy": 0.5, "specular_rotation": 0.1}
+# Of materials, what is told, or nothing.
+TOLD = [
+    ("open_pbr_surface", {**COATED, "specular_color": [1.0, 1.0, 1.0]}, None),
+    ("open_pbr_surface", {**COATED, "specular_color": [0.6, 0.6, 0.6]}, "edge colours"),
+    ("standard_surface", TURNED, "rounded to quarter turns"),
+    ("standard_surface", {"coat": 1.0, "coat_roughness": 0.6}, "coats rougher than 0.32"),
+]
+
+
+@pytest.mark.parametrize(("model", "given", "message"), TOLD)
+def test_what_cannot_be_had_of_a_material_is_told(model, given, message):
+    _, notes = entry(look(model, **given))
+    assert [message in warning for warning in told(notes.warn, "stage")[1]] == [True] * bool(message)
 
 
 def test_the_strength_of_reflections_is_an_index_of_refraction():
@@ -282,9 +279,6 @@ def test_coats_dim_what_lies_below():
     coated = bsdf_of("standard_surface", coat=1.0, coat_IOR=1.6, coat_roughness=0.2)
     expected = [(0.6 / 2.6) ** 2 / 0.04, 0.06 / 0.099]
     assert [coated["clearcoat"], coated["clearcoat_gloss"]] == pytest.approx(expected)
-    _, notes = entry(look("standard_surface", coat=1.0, coat_roughness=0.6))
-    with pytest.warns(UserWarning, match=r"coats rougher than 0\.32"):
-        notes.warn("file")
 
 
 def test_bodies_absorb_nothing_without_a_distance_and_all_of_a_colour_that_they_have_none_of():
