@@ -7,7 +7,7 @@ from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.evaluation.element import curvature
 from reference.bars import CURVATURE
-from reference.exact_samples import ORDINARY, curvature_error, samples_at, subdominant
+from reference.exact_samples import ORDINARY, bumpy_ball, curvature_error, samples_at, subdominant
 
 # (|lambda_4| / lambda_2^2) is approached as the next eigenvalues fade, within 100 levels and more.
 GROWTH = 1e-3
@@ -30,7 +30,7 @@ def growth(scheme, valence):
 @EVERY_SCHEME
 def test_the_sign_is_right_where_the_surface_turns_away_from_the_limit_normal(scheme, np_rng):
     """Crumpled, the surface is no graph over its limit plane, and in places it stands upright on that."""
-    cage = samples_at(scheme, 7).cage
+    cage = bumpy_ball(scheme, 7)
     surface = LimitSurface(cage.with_positions(np_rng.standard_normal(cage.positions.shape)), scheme)
     # The elements around the point.
     samples = surface.evaluate(np_rng.integers(0, 7, 400), np_rng.random((400, 2)) / 2, derivatives=2)
@@ -55,7 +55,7 @@ def test_the_sign_is_right_where_the_surface_turns_away_from_the_limit_normal(sc
 )
 def test_curvature_grows_with_the_level_by_its_eigenvalues(scheme, valence, expected):
     # plugin/MATHEMATICS.md, section 9: (|lambda_4| / lambda_2^2)^n.
-    surface = LimitSurface(samples_at(scheme, valence).cage, scheme)
+    surface = LimitSurface(bumpy_ball(scheme, valence), scheme)
     uv = np.array([[0.55, 0.3], [0.2, 0.7], [0.4, 0.4]])
     shallow, deep = (size(curvatures_at(surface, uv * 2.0**-level)) for level in (150, 250))
     np.testing.assert_allclose((deep / shallow) ** (1 / 100), expected, rtol=GROWTH)
@@ -63,14 +63,14 @@ def test_curvature_grows_with_the_level_by_its_eigenvalues(scheme, valence, expe
 
 @pytest.mark.parametrize("valence", [5, 6, 8])
 def test_curvature_of_defective_doo_sabin_grows_linearly_with_the_level(valence):
-    surface = LimitSurface(samples_at("doo_sabin", valence).cage, "doo_sabin")
+    surface = LimitSurface(bumpy_ball("doo_sabin", valence), "doo_sabin")
     levels = np.array([100, 200, 300])
     first, second = np.diff(size(curvatures_at(surface, np.ldexp([[0.55, 0.3]], -levels[:, None]))))
     assert 0 < first == pytest.approx(second, rel=1e-2)
 
 
 def test_curvature_vanishes_at_a_catmull_clark_vertex_of_valence_3():
-    surface = LimitSurface(samples_at("catmull_clark", 3).cage)
+    surface = LimitSurface(bumpy_ball("catmull_clark", 3))
     np.testing.assert_array_equal(curvatures_at(surface, [[0.0, 0.0]]), 0)
     assert np.abs(curvatures_at(surface, [[0.0, 2.0**-900]])).max() < 1e-2
 
@@ -84,7 +84,7 @@ def test_curvature_vanishes_at_a_catmull_clark_vertex_of_valence_3():
     ],
 )
 def test_there_are_no_second_derivatives_and_no_curvature_at_other_extraordinary_points(scheme, valence):
-    surface = LimitSurface(samples_at(scheme, valence).cage, scheme)
+    surface = LimitSurface(bumpy_ball(scheme, valence), scheme)
     at_point = surface.evaluate(0, [[0.0, 0.0]], derivatives=2)
     assert np.isnan(curvatures(at_point)).all()
     assert np.isnan(seconds(at_point)).all()
@@ -93,7 +93,7 @@ def test_there_are_no_second_derivatives_and_no_curvature_at_other_extraordinary
 
 @EVERY_SCHEME
 def test_there_is_curvature_at_an_ordinary_point(scheme):
-    surface = LimitSurface(samples_at(scheme, ORDINARY[scheme]).cage, scheme)
+    surface = LimitSurface(bumpy_ball(scheme, ORDINARY[scheme]), scheme)
     at_point, beside = (curvatures_at(surface, [[t, 0.0]]) for t in (0.0, 2.0**-40))
     assert curvature_error(at_point, beside).max() < 1e-6
 

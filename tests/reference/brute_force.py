@@ -2,17 +2,19 @@
 
 Nothing of `mitsuba_subdivision` is used, no subdivision matrix and no eigenvector: the control cage around an element
 is refined by the scheme's rules until the sample lies in a regular patch, which is then a B-spline or a box spline.
-Conventions are those of plugin/ARCHITECTURE.md. Results are `Decimal`; arithmetic on them outside `precision` is
-rounded by the caller's decimal context (28 digits unless set). ``numpy.array(sample.p, dtype=float)`` rounds once.
+Conventions are those of plugin/ARCHITECTURE.md. Results are arrays of `Decimal`; arithmetic on them outside `precision`
+is rounded by the caller's decimal context (28 digits unless set). ``sample.p.astype(float)`` rounds once.
 """
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal, getcontext
 from fractions import Fraction
+from typing import NamedTuple
 
-from reference.decimals import Vector, combine, precision, unit_normal
-from reference.rules import RULES, Face, incidence, limit_masks, rotate
+import numpy as np
+
+from reference.rules import RULES, Face, combine, incidence, limit_masks, precision, rotate
 from reference.splines import box_weights, tensor_weights
 
 # A coordinate of size one loses less than one digit per level to the difference with its neighbours, also in second
@@ -23,26 +25,25 @@ QUAD_CORNERS = ((0, 0), (1, 0), (1, 1), (0, 1))
 TRIANGLE_CORNERS = ((0, 0), (1, 0), (0, 1))
 
 
-@dataclass(frozen=True)
-class Sample:
-    """Point and derivatives of the limit surface with respect to the element's own (u, v)."""
+class Sample(NamedTuple):
+    """Point, derivatives by the element's own (u, v), unit normal, and curvatures of the limit surface."""
 
-    p: Vector
-    dp_du: Vector
-    dp_dv: Vector
-    d2p_duu: Vector | None
-    d2p_duv: Vector | None
-    d2p_dvv: Vector | None
-    n: Vector | None  # Unit normal; None where positions are not three-dimensional.
+    p: np.ndarray
+    dp_du: np.ndarray
+    dp_dv: np.ndarray
+    d2p_duu: np.ndarray
+    d2p_duv: np.ndarray
+    d2p_dvv: np.ndarray
+    n: np.ndarray
+    curvature: tuple[Decimal, Decimal]  # Gaussian and mean, by the fundamental forms.
     level: int  # Number of refinements.
 
 
-@dataclass(frozen=True)
-class Limit:
+class Limit(NamedTuple):
     """Point and unit normal of the limit surface at a vertex or face centre."""
 
-    p: Vector
-    n: Vector
+    p: np.ndarray
+    n: np.ndarray
 
 
 @dataclass
@@ -57,39 +58,36 @@ class _Node:
 class BruteForce:
     """Evaluate the limit surface of one control cage; refined neighbourhoods are kept for the next sample.
 
-    Positions are taken exactly, of any dimension: with unit vectors, samples are the weights of the control points.
-    Faces are counter-clockwise from outside; the one-ring of an element that is asked for must be closed. ``digits``
-    are the least number; deep samples use more.
+    Positions are taken exactly. Faces are counter-clockwise from outside; the one-ring of an element that is asked for
+    must be closed. ``digits`` are the least number; deep samples use more.
     """
 
     def __init__(self, scheme: str, positions, faces, digits: int = 80):
         self.scheme = scheme
         self.rules = RULES[scheme]
         self.digits = digits
-        exactly = ((x if isinstance(x, (int, Decimal)) else float(x) for x in point) for point in positions)
-        self.points = {i: tuple(map(Decimal, point)) for i, point in enumerate(exactly)}
+        self.points = {i: np.array([Decimal(float(x)) for x in point]) for i, point in enumerate(positions)}
         self.faces = [tuple(int(v) for v in face) for face in faces]
         self.at_vertex, _ = incidence(self.faces)
         self.roots = {}
 
-    def evaluate(self, element: int, corner: int, u, v, derivatives: int = 1, min_level: int = 0) -> Sample:
-        """Limit surface at (u, v) of an element, refined at least ``min_level`` times.
+    def evaluate(self, element: int, corner: int, u: float, v: float, min_level: int = 0) -> Sample:
+        """Limit surface at (u, v) of an element, which are taken exactly, refined at least ``min_level`` times.
 
-        ``u`` and ``v`` may be float, int, Fraction or Decimal and are taken exactly. Doo-Sabin's corner ``i`` is the
-        ``i``-th face counter-clockwise about the vertex, from the face of least index. On the line between two
-        patches the sample belongs to the patch of greater u (greater v).
+        Doo-Sabin's corner ``i`` is the ``i``-th face counter-clockwise about the vertex, from the face of least index.
+        On the line between two patches the sample belongs to the patch of greater u (greater v).
         """
-        u, v = (Fraction(x if isinstance(x, (int, Fraction, Decimal)) else float(x)) for x in (u, v))
+        u, v = Fraction(float(u)), Fraction(float(v))
         if not (0 <= u <= 1 and 0 <= v <= 1 and (self.scheme != "loop" or u + v <= 1)):
             raise ValueError(f"(u, v) = ({u}, {v}) is outside the domain of {self.scheme}")
         digits, sample = self.digits, None
         while sample is None:
             with precision(digits):
-                sample = self._evaluate(element, corner, u, v, derivatives, min_level)
+                sample = self._evaluate(element, corner, u, v, min_level)
             digits *= 2
         return sample
 
-    def _evaluate(self, element, corner, u, v, derivatives, min_level) -> Sample | None:
+    def _evaluate(self, element, corner, u, v, min_level) -> Sample | None:
         """The sample, or None when it needs more digits than the context has."""
         digits = getcontext().prec
         if (element, corner, digits) not in self.roots:
@@ -113,11 +111,13 @@ class BruteForce:
         degree = 3 if self.scheme == "catmull_clark" else 2
         weight = box_weights(u, v) if self.scheme == "loop" else tensor_weights(degree, u, v)
         controls = [node.points[vertex] for vertex in grid.values()]
-        rows = [combine(row, controls) for row in zip(*(weight(*place) for place in grid), strict=True)]
-        factors = (1, scale, scale, scale**2, scale**2, scale**2)
-        rows = [tuple(c * factor for c in row) for row, factor in zip(rows, factors, strict=True)]
-        second = rows[3:] if derivatives > 1 else [None] * 3
-        return Sample(*rows[:3], *second, n=unit_normal(rows[1], rows[2]), level=level)
+        weights = np.array([weight(*place) for place in grid])
+        p, a, b, *second = np.dot(weights.T, np.stack(controls)) * np.array([[scale**k] for k in (0, 1, 1, 2, 2, 2)])
+        n = unit_normal(a, b)
+        aa, ab, bb = np.dot(a, a), np.dot(a, b), np.dot(b, b)
+        e, f, g = np.dot(np.stack(second), n)
+        area = aa * bb - ab * ab
+        return Sample(p, a, b, *second, n, ((e * g - f * f) / area, (e * bb - 2 * f * ab + g * aa) / (2 * area)), level)
 
     def limit(self, vertex: int | None = None, face: int | None = None) -> Limit:
         """Limit point and normal at a vertex (Catmull-Clark, Loop), or at the centre of a face (not for Loop).
@@ -220,6 +220,11 @@ class BruteForce:
                     grid[x + dx + turned[0], y + dy + turned[1]] = face[2]
                 neighbour, (dx, dy) = face[-1], turned
         return grid
+
+
+def unit_normal(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    cross = np.cross(a, b)
+    return cross / np.dot(cross, cross).sqrt()
 
 
 def quad_child(u: Fraction, v: Fraction) -> tuple[int, Fraction, Fraction, int]:

@@ -1,7 +1,6 @@
 """Samples towards one isolated extraordinary point of each scheme and valence, with their exact values."""
 
 from dataclasses import dataclass
-from decimal import Decimal
 from functools import lru_cache
 
 import numpy as np
@@ -10,12 +9,9 @@ from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.mesh.connectivity import Topology
 from patches.closed_cages import extraordinary_face, extraordinary_triangles, torus
 
-from reference.brute_force import BruteForce, Sample
-from reference.decimals import precision
+from reference.brute_force import BruteForce
 
 LEVELS = (0, 1, 2, 5, 10, 17, 24, 31, 38, 45)
-# More than any sample is computed with, so that taking results apart loses nothing.
-DIGITS = 200
 SCHEMES = ("catmull_clark", "loop", "doo_sabin")
 # With this valence (for Doo-Sabin, size of a face) the point is an ordinary one.
 ORDINARY = {"catmull_clark": 4, "loop": 6, "doo_sabin": 4}
@@ -111,19 +107,6 @@ def curvature_error(computed: np.ndarray, exact: np.ndarray) -> np.ndarray:
     return np.abs(computed - exact) / np.stack([unit, np.sqrt(unit)])
 
 
-def exact_curvature(sample: Sample) -> tuple[Decimal, Decimal]:
-    """Gaussian and mean curvature of a decimal sample, by the fundamental forms."""
-    a, b = sample.dp_du, sample.dp_dv
-    aa, ab, bb = _dot(a, a), _dot(a, b), _dot(b, b)
-    e, f, g = (_dot(second, sample.n) for second in (sample.d2p_duu, sample.d2p_duv, sample.d2p_dvv))
-    area = aa * bb - ab * ab
-    return (e * g - f * f) / area, (e * bb - 2 * f * ab + g * aa) / (2 * area)
-
-
-def _dot(a, b):
-    return sum(x * y for x, y in zip(a, b, strict=True))
-
-
 def uv_towards_corner(scheme: str, seed: int, levels: tuple[int, ...] = LEVELS) -> np.ndarray:
     """Two places inside and three on the borders of an element, shrunk towards (0, 0) by each level."""
     inside = np.random.default_rng(seed).random((len(levels), 2, 2))
@@ -144,19 +127,14 @@ def samples_at(scheme: str, valence: int, levels: tuple[int, ...] = LEVELS) -> E
         # Its neighbours are extraordinary as well.
         uv = uv[uv.max(axis=1) < 1]
     reference = BruteForce(scheme, cage.positions, faces_of(cage))
-    samples = [reference.evaluate(0, 0, u, v, derivatives=2) for u, v in uv]
+    samples = [reference.evaluate(0, 0, *at) for at in uv]
     if valence == 2:
         # No masks; but lambda_2 is 1/4, and so is the subdominant part after 60 levels less than 1e-36.
-        limit = reference.evaluate(0, 0, 2.0**-60, 0)
+        deep = reference.evaluate(0, 0, 2.0**-60, 0)
+        limit = deep.p, deep.n
     else:
         limit = reference.limit(**{"face" if scheme == "doo_sabin" else "vertex": 0})
-    with precision(DIGITS):
-        values = [_floats([getattr(sample, name) for sample in samples]) for name in ("p", "dp_du", "dp_dv", "n")]
-        second = _floats([[s.d2p_duu for s in samples], [s.d2p_duv for s in samples], [s.d2p_dvv for s in samples]])
-        curvature = _floats([exact_curvature(sample) for sample in samples]).T
-        limits = _floats(limit.p), _floats(limit.n)
-    return ExactSamples(scheme, valence, cage, uv, *values, second, curvature, *limits)
-
-
-def _floats(decimals) -> np.ndarray:
-    return np.array(decimals, dtype=float)
+    p, dp_du, dp_dv, *second, n, curvature, _ = (np.array(values, dtype=float) for values in zip(*samples, strict=True))
+    return ExactSamples(
+        scheme, valence, cage, uv, p, dp_du, dp_dv, n, np.stack(second), curvature.T, *np.array(limit, dtype=float)
+    )

@@ -1,18 +1,47 @@
-"""Refinement rules and limit masks of the three schemes.
+"""Refinement rules and limit masks of the three schemes, in decimal arithmetic.
 
 Each rule takes the faces and points of a neighbourhood, and gives the refined faces as tuples of keys, and a function
 from a key to its point. A key names what the new vertex comes from. Only the keys whose surroundings are all in the
-neighbourhood may be asked for.
+neighbourhood may be asked for. Points are NumPy arrays of `Decimal`.
 """
 
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Sequence
-from decimal import Decimal
+from contextlib import contextmanager
+from decimal import Decimal, getcontext, localcontext
 from functools import cache
 
-from reference.decimals import combine, cos_of_turn, mean, sin_of_turn
+import mpmath
+import numpy as np
 
 Face = tuple[Hashable, ...]
+
+
+@contextmanager
+def precision(digits: int):
+    """Decimal arithmetic with this many digits inside the block."""
+    with localcontext() as context:
+        context.prec = digits
+        yield
+
+
+@cache
+def _cos_of_turn(k: int, n: int, digits: int) -> Decimal:
+    with mpmath.workdps(digits + 10):
+        return Decimal(mpmath.nstr(mpmath.cospi(mpmath.mpf(2 * k) / n), digits + 5))
+
+
+def cos_of_turn(k: int, n: int) -> Decimal:
+    """``cos(2 pi k / n)`` to the precision of the current context."""
+    return _cos_of_turn(k, n, getcontext().prec)
+
+
+def combine(weights: Sequence[Decimal], points: Sequence[np.ndarray]) -> np.ndarray:
+    return np.dot(np.array(weights, dtype=object), np.stack(points))
+
+
+def mean(points: Sequence[np.ndarray]) -> np.ndarray:
+    return sum(points) / len(points)
 
 
 def rotate(items: Sequence, k: int) -> tuple:
@@ -125,7 +154,7 @@ def limit_masks(scheme: str, valence: int) -> tuple[list[Decimal], list[Decimal]
     n = valence
     if n < 3:
         raise ValueError(f"no limit masks for valence {n}")
-    cos, sin = ([turn(i, n) for i in range(n)] for turn in (cos_of_turn, sin_of_turn))
+    cos, sin = ([cos_of_turn(4 * i - shift, 4 * n) for i in range(n)] for shift in (0, n))
     if scheme == "doo_sabin":
         return [Decimal(1) / n] * n, cos, sin
     if scheme == "loop":

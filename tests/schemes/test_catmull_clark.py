@@ -38,7 +38,7 @@ def test_refinement_follows_the_rules(topology):
     begin = {"vertex": 0, "edge": t.vertex_count, "face": t.vertex_count + t.edge_count}
     ends = zip(t.face_vertices.tolist(), t.face_vertices[t.next].tolist(), strict=True)
     edges = {frozenset(pair): edge for pair, edge in zip(ends, t.edge.tolist(), strict=True)}
-    decimals = {i: tuple(map(Decimal, point)) for i, point in enumerate(points.tolist())}
+    decimals = [np.array([Decimal(x) for x in point]) for point in points.tolist()]
     keyed, point = RULES["catmull_clark"](polygons(t), decimals)
 
     def number(key):

@@ -10,7 +10,7 @@ from patches.closed_cages import tetrahedron
 from peers.fidelity_cages import book, fan, joined, pole
 from peers.fidelity_cages import cube as box
 from reference.bars import NORMAL_FLOAT32, NORMAL_FLOAT32_VALENCES
-from reference.exact_samples import SCHEMES, angle, samples_at
+from reference.exact_samples import SCHEMES, angle, bumpy_ball
 from shapes.cages import RING, cube, load, with_attributes
 from shapes.scenes import SINGLE, WIDTHS, buffer, hit, scene_with, vertices
 from shapes.updates import update
@@ -53,7 +53,7 @@ with_warnings = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.Cag
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_normals_of_all_vertices_are_right(scheme, valence):
     # Bumpy, with faces as narrow as the valence makes them.
-    cage = samples_at(scheme, valence).cage
+    cage = bumpy_ball(scheme, valence)
     expected = LimitSurface(cage, scheme).tessellate(4).normals
     assert angle(buffer(make(cage, scheme=scheme), "vertex_normals"), expected).max() <= NORMAL_FLOAT32
 
