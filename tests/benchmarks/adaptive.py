@@ -13,7 +13,6 @@ and of the surface from the triangles follow, measured as in ``tests/tessellatio
 """
 
 import argparse
-import json
 import sys
 import time
 import warnings
@@ -22,54 +21,68 @@ from pathlib import Path
 import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.tessellation.criterion import Criterion, Measure, Sensor
-from processes import measured, peak_memory
+from processes import ROOT, measured, peak_memory, print_row, run
 
 OUTLINES = "outlines"
 # Where distances are measured.
 MOST_SEGMENTS = 1024
-HEADER = "model, scheme, error         faces   uniform             s    MB   adaptive            s    MB   us/triangle"
 
 
-def main(arguments=None):
-    options = _parsed(arguments)
-    if options.process:
-        print(json.dumps(_measured(*json.loads(options.process))))
-        return
-    print(HEADER)
-    for model in options.models:
-        for scheme in options.schemes:
-            for error in options.errors:
-                print(_row(model, scheme, error, options.rate, options.distances), flush=True)
-
-
-def _parsed(arguments):
+def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("models", nargs="*", type=Path, metavar="MODEL", help="OBJ, PLY or USD files")
     parser.add_argument("--schemes", nargs="+", default=["catmull_clark"])
     parser.add_argument("--errors", nargs="+", type=_error, default=[1.0, 1e-3, 1e-4, OUTLINES])
     parser.add_argument("--rate", type=int, default=1, help="of the uniform tessellation (default: 1)")
     parser.add_argument("--distances", action="store_true", help="measure distances in both directions, too")
-    parser.add_argument("--process", help=argparse.SUPPRESS)
-    return parser.parse_args(arguments)
+    options = parser.parse_args()
+    columns = ["faces", "uniform", "s", "MB", "adaptive", "s", "MB", "us/triangle"]
+    print_row("model, scheme, error", *columns, *(["to surface", "from surface"] * options.distances), width=13)
+    for model in options.models:
+        for scheme in options.schemes:
+            for error in options.errors:
+                _show(model, scheme, error, options)
 
 
 def _error(word):
     return word if word == OUTLINES else float(word)
 
 
-def _row(model, scheme, error, rate, has_distances):
-    """One line of the table; each side is measured in a process of its own."""
-    name = f"{model.name}, {scheme}, {error if error == OUTLINES else format(error, 'g')}"
+def _show(model, scheme, error, options):
+    """One row of the table; each side is measured in a process of its own."""
+    uniform = measured(tessellations, model, scheme, None, options.rate)
+    adaptive = measured(tessellations, model, scheme, error, None)
+    beyond = adaptive["seconds"] - (2 * uniform["seconds"] if options.rate == 1 else 0)
+    cells = [f"{adaptive['faces']:,}"]
+    for side in (uniform, adaptive):
+        cells += [f"{side['triangles']:,}", f"{side['seconds']:.2f}", f"{side['memory']:.0f}"]
+    cells.append(f"{1e6 * max(0, beyond) / adaptive['triangles']:.2f}")
+    if options.distances:
+        away = measured(farthest, model, scheme, error)
+        cells += [f"{away[name]:.3f}" for name in ("to surface", "from surface")]
+    print_row(f"{model.name}, {scheme}, {error if error == OUTLINES else format(error, 'g')}", *cells, width=13)
 
-    def of(kind):
-        words = json.dumps([str(model), scheme, error, rate, kind])
-        return measured(name, [sys.executable, __file__, "--process", words])
 
-    uniform, adaptive = of("uniform"), of("adaptive")
-    distances = " {triangles:8.3f} {surface:8.3f}".format(**of("distances")) if has_distances else ""
-    columns = "".join("{triangles:10,} {seconds:12.2f} {memory:5.0f}   ".format(**side) for side in (uniform, adaptive))
-    beyond = adaptive["seconds"] - 2 * uniform["seconds"] if rate == 1 else adaptive["seconds"]
-    return f"{name:27} {adaptive['faces']:6,} {columns}{1e6 * max(0, beyond) / adaptive['triangles']:8.2f}{distances}"
+def tessellations(_clock, model, scheme, error, rate):
+    """Sums over all surfaces of a file, of adaptive tessellations where an error is given."""
+    faces = triangles = seconds = memory = 0
+    for cage in _cages(Path(model)):
+        surface = LimitSurface(cage, scheme)
+        # Classes are found once for all tessellations.
+        assert surface.patches.classes
+        taken, before = [], peak_memory()
+        for _ in range(3):
+            start = time.process_time()
+            table = surface.sampling(rate) if error is None else surface.adaptive_sampling(_criterion(cage, error))
+            table.apply(cage.positions)
+            count = len(table.triangles)
+            taken.append(time.process_time() - start)
+            del table
+        seconds += min(taken)
+        triangles += count
+        faces += cage.face_count
+        memory += peak_memory() - before
+    return {"faces": faces, "triangles": triangles, "seconds": seconds, "memory": memory}
 
 
 def _criterion(cage, error):
@@ -82,31 +95,9 @@ def _criterion(cage, error):
     return Criterion(Measure.CHORD, 0.1, sensor, sensor)
 
 
-def _measured(model, scheme, error, rate, kind):
-    if kind == "distances":
-        return _distances(model, scheme, error)
-    faces = triangles = seconds = memory = 0
-    for cage in _cages(Path(model)):
-        surface = LimitSurface(cage, scheme)
-        # Classes are found once for all tessellations.
-        assert surface.patches.classes
-        taken, before = [], peak_memory()
-        for _ in range(3):
-            start = time.process_time()
-            table = surface.sampling(rate) if kind == "uniform" else surface.adaptive_sampling(_criterion(cage, error))
-            table.apply(cage.positions)
-            count = len(table.triangles)
-            taken.append(time.process_time() - start)
-            del table
-        seconds += min(taken)
-        triangles += count
-        faces += cage.face_count
-        memory += peak_memory() - before
-    return {"faces": faces, "triangles": triangles, "seconds": seconds, "memory": memory}
-
-
-def _distances(model, scheme, error):
-    sys.path.append(str(Path(__file__).parents[1]))
+def farthest(_clock, model, scheme, error):
+    """How far triangles are from the surface, and the surface is from them, at most."""
+    sys.path.append(str(ROOT / "tests"))
     from tessellation.distances import distances
 
     largest = np.zeros(2)
@@ -114,7 +105,7 @@ def _distances(model, scheme, error):
         surface, criterion = LimitSurface(cage, scheme), _criterion(cage, error)
         away = distances(surface, surface.adaptive_sampling(criterion, MOST_SEGMENTS))
         largest = np.maximum(largest, np.divide(away, criterion.error))
-    return dict(zip(("triangles", "surface"), largest.tolist(), strict=True))
+    return dict(zip(("to surface", "from surface"), largest.tolist(), strict=True))
 
 
 def _cages(path):
@@ -135,4 +126,4 @@ def _cages(path):
 
 
 if __name__ == "__main__":
-    main()
+    run(main, tessellations, farthest)

@@ -7,18 +7,12 @@ import numpy as np
 from mitsuba_subdivision import ControlCage
 from mitsuba_subdivision.cage import named_cages
 from scipy.sparse import csr_array
+from scipy.spatial import ConvexHull
 
 CACHE = Path(tempfile.gettempdir()) / "mitsuba-subdivision-benchmarks"
 # Four corners of each of three golden rectangles.
 SHORT, LONG = np.array([(-1, 1, -1, 1), np.repeat([1, -1], 2) * (1 + 5**0.5) / 2])
 ICOSAHEDRON = np.block([[SHORT, 0 * LONG, LONG], [LONG, SHORT, 0 * LONG], [0 * LONG, LONG, SHORT]]).T
-ICOSAHEDRON_FACES = np.transpose(
-    [
-        (0, 0, 0, 0, 0, 1, 5, 11, 10, 7, 3, 3, 3, 3, 3, 4, 2, 6, 8, 9),
-        (11, 5, 1, 7, 10, 5, 11, 10, 7, 1, 9, 4, 2, 6, 8, 9, 4, 2, 6, 8),
-        (5, 1, 7, 10, 11, 9, 4, 2, 6, 8, 4, 2, 6, 8, 9, 5, 11, 10, 7, 1),
-    ]
-)
 
 
 def cube():
@@ -102,30 +96,20 @@ def _edges(faces, vertex_count):
 
 
 def _geodesic_sphere(frequency):
-    """An icosahedron with each triangle cut into frequency^2."""
-    j, i = np.indices((frequency + 1, frequency + 1)).reshape(2, -1)
-    inside = i + j <= frequency
-    i, j = i[inside], j[inside]
-    weights = np.stack([frequency - i - j, i, j], axis=1)
-    points = np.einsum("sk,fkx->fsx", weights, ICOSAHEDRON[ICOSAHEDRON_FACES]) / frequency
-    points /= np.linalg.norm(points, axis=2, keepdims=True)
-    # Points on the edges are found once for each of two faces, and equal to rounding.
-    _, first, number = np.unique(
-        np.rint(points.reshape(-1, 3) * 1e8).astype(np.int64), axis=0, return_index=True, return_inverse=True
-    )
-
-    def at(i, j):
-        return j * (frequency + 1) - j * (j - 1) // 2 + i
-
-    up, down = i + j < frequency, i + j < frequency - 1
-    cells = [
-        np.stack([at(i, j), at(i + 1, j), at(i, j + 1)], axis=1)[up],
-        np.stack([at(i + 1, j), at(i + 1, j + 1), at(i, j + 1)], axis=1)[down],
-    ]
-    # Numbered as they are met, so that neighbours lie near each other in memory, as in most models.
-    number = np.argsort(np.argsort(first))[number]
-    triangles = number.reshape(len(ICOSAHEDRON_FACES), -1)[:, np.concatenate(cells)].reshape(-1, 3)
-    return points.reshape(-1, 3)[np.sort(first)], triangles
+    """An icosahedron with each triangle cut into frequency^2, on the sphere."""
+    i, j = np.indices((frequency + 1, frequency + 1)).reshape(2, -1)
+    weights = np.stack([frequency - i - j, i, j], axis=1)[i + j <= frequency]
+    points = np.einsum("sk,fkx->fsx", weights, ICOSAHEDRON[ConvexHull(ICOSAHEDRON).simplices]).reshape(-1, 3)
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    # Points on edges are there once for each of two faces, equal to rounding. They stay in order, so that neighbours
+    # lie near each other in memory, as in most models; and so do triangles.
+    _, first = np.unique(np.rint(points * 1e8).astype(np.int64), axis=0, return_index=True)
+    points = points[np.sort(first)]
+    triangles = ConvexHull(points).simplices
+    triangles = triangles[np.argsort(triangles.min(axis=1), kind="stable")].astype(np.int64)
+    is_inside_out = np.linalg.det(points[triangles]) < 0
+    triangles[is_inside_out] = triangles[is_inside_out, ::-1]
+    return points, triangles
 
 
 def _flip_edges(points, triangles, low, high, rounds):

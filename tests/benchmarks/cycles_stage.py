@@ -1,53 +1,31 @@
-"""One process of `whole_stage.py`, for a Python that has Blender as a module: Cycles at a stage.
+"""What `whole_stage.py` measures of Cycles, with a Python that has Blender as a module."""
 
-BEGUN=SECONDS PYTHON tests/benchmarks/cycles_stage.py STAGE.usda CAMERA.json
-
-SECONDS is when the process began, by `time.monotonic`.
-"""
-
-import json
 import math
 import os
-import resource
-import sys
 import tempfile
-import time
-from itertools import pairwise
 
 import bpy
 import mathutils
+from processes import run
 
-STAGES = ("imports", "read", "load", "first picture", "next picture")
 
-
-def main(stage, camera):
+def cycles(clock, stage, camera):
     """Render a stage twice by a camera of Mitsuba's; Catmull-Clark meshes at one pixel, by adaptive subdivision."""
-    with open(camera) as file:
-        camera = json.load(file)
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    clock = [(float(os.environ["BEGUN"]), 0.0), (time.monotonic(), time.process_time())]
-
-    def lap():
-        clock.append((time.monotonic(), time.process_time()))
-
+    clock.lap("imports")
     bpy.ops.wm.usd_import(
         filepath=stage, import_subdivision=True, import_cameras=False, apply_unit_conversion_scale=False
     )
-    lap()
+    clock.lap("read")
     scene = bpy.context.scene
     _subdivide([mesh for mesh in bpy.data.objects if mesh.type == "MESH"])
     _set_up(scene, camera)
-    lap()
+    clock.lap("load")
     with tempfile.TemporaryDirectory() as folder:
         scene.render.filepath = os.path.join(folder, "picture.png")
-        for _ in range(2):
+        for name in ("first picture", "next picture"):
             bpy.ops.render.render(write_still=True)
-            lap()
-    laps = dict(zip(STAGES, pairwise(clock), strict=True))
-    laps |= {"program to picture": (clock[0], clock[4]), "file to picture": (clock[1], clock[4])}
-    seconds = {name: [end - begin for begin, end in zip(*pair, strict=True)] for name, pair in laps.items()}
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10)
-    print(json.dumps({"seconds": seconds, "memory": memory}))
+            clock.lap(name)
 
 
 def _subdivide(meshes):
@@ -113,4 +91,4 @@ def _set_up(scene, camera):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    run(None, cycles)

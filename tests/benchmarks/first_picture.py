@@ -12,7 +12,7 @@ import time
 SHAPES = ("subdivision", "ply")
 
 
-def main(arguments=None):
+def main():
     # One process of these imports nothing else before its clock starts.
     import argparse
     import tempfile
@@ -27,54 +27,45 @@ def main(arguments=None):
     parser.add_argument("--variants", nargs="+", default=["scalar_rgb", "llvm_ad_rgb"])
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--cache", type=Path, default=CACHE, help=f"folder of cages; {CACHE}")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     for cage in options.cages:
         path = ROOT / "scenes/cages" / f"{cage}.obj"
         if not path.exists():
             path = cage_files(cage, options.cache)["obj"]
         with tempfile.TemporaryDirectory() as folder:
-            files = {"subdivision": path, "ply": Path(folder) / "dense.ply"}
-            # Bytecode is kept.
-            variables = {"PYTHONDONTWRITEBYTECODE": None, "PYTHONPYCACHEPREFIX": folder}
-            run(variables, "scalar_rgb", "subdivision", path, options.rate, files["ply"])
-            for variant in options.variants:
-                show(cage, variant, in_turns(variables, variant, files, options))
+            compare(cage, {"subdivision": path, "ply": Path(folder) / "dense.ply"}, folder, options)
 
 
-def in_turns(variables, variant, files, options):
-    """Seconds of each stage, for each kind of shape: one list for each run."""
+def compare(cage, files, folder, options):
+    """Measure and show medians of each stage for both shapes, in turns."""
     import os
+    import statistics
 
-    from processes import ran
+    from processes import print_row, printed, ran
 
+    # Bytecode is kept.
+    variables = {"PYTHONDONTWRITEBYTECODE": None, "PYTHONPYCACHEPREFIX": folder}
+
+    def run(variant, kind, *written, **more):
+        words = [sys.executable, __file__, "--process", variant, kind, files[kind], options.rate, *written]
+        return printed(words, **variables, **more)
+
+    run("scalar_rgb", "subdivision", files["ply"])
     # The package chooses a library by itself; Mitsuba would take another one.
     find = "from mitsuba_subdivision.llvm import select_llvm; print(select_llvm().path or '')"
     library = ran([sys.executable, "-c", find], **variables).stdout.strip()
     of_kind = {"subdivision": None, "ply": library or os.environ.get("DRJIT_LIBLLVM_PATH")}
-    runs = {kind: [] for kind in SHAPES}
-    for repeat in range(options.repeats + 1):
-        # The order changes, so that neither side always finds the other's files in memory. The first runs compile.
-        for kind in SHAPES if repeat % 2 else SHAPES[::-1]:
-            its_variables = {**variables, "DRJIT_LIBLLVM_PATH": of_kind[kind]}
-            seconds = run(its_variables, variant, kind, files[kind], options.rate)
-            if repeat:
-                runs[kind].append(seconds)
-    return runs
-
-
-def run(variables, variant, kind, *words):
-    from processes import measured
-
-    return measured(kind, [sys.executable, __file__, "--process", variant, kind, *words], **variables)
-
-
-def show(cage, variant, runs):
-    import statistics
-
-    print(f"\n{cage}, {variant:<26}this package   PLY (ms)   ratio")
-    for stage in runs["ply"][0]:
-        ours, mitsuba = (statistics.median(run[stage] for run in runs[kind]) * 1e3 for kind in SHAPES)
-        print(f"  {stage:<34}{ours:12.1f}{mitsuba:11.1f}{ours / mitsuba:8.2f}")
+    for variant in options.variants:
+        runs = {kind: [] for kind in SHAPES}
+        for repeat in range(options.repeats + 1):
+            # The order changes, so that neither side always finds the other's files in memory. The first runs compile.
+            for kind in SHAPES if repeat % 2 else SHAPES[::-1]:
+                runs[kind].append(run(variant, kind, DRJIT_LIBLLVM_PATH=of_kind[kind]))
+        print()
+        print_row(f"{cage}, {variant}", "this package (ms)", "PLY (ms)", "ratio")
+        for stage in runs["ply"][0]:
+            ours, theirs = (statistics.median(taken[stage] for taken in runs[kind][1:]) * 1e3 for kind in SHAPES)
+            print_row(f"  {stage}", f"{ours:.1f}", f"{theirs:.1f}", f"{ours / theirs:.2f}")
 
 
 def process(variant, kind, path, rate, write=None):

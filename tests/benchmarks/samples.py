@@ -7,32 +7,37 @@ again to control points. Only the ratios within one run mean anything.
 """
 
 import argparse
-import time
 from pathlib import Path
 
 import mitsuba_subdivision as msub
 import numpy as np
+from processes import ROOT, Clock
 
-ROOT = Path(__file__).parents[2]
 
-
-def main(arguments=None):
+def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("cages", nargs="*", type=Path, default=[ROOT / "scenes/cages/human.obj"])
     parser.add_argument("--samples", type=int, default=20000)
     parser.add_argument("--rate", type=int, default=4)
     parser.add_argument("--repeats", type=int, default=15)
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     for path in options.cages:
-        surface, rng = msub.LimitSurface(msub.ControlCage.from_file(path)), np.random.default_rng(0)
-        classes = surface.patches.class_count
-        places = [random_locations(surface, rng, options.samples) for _ in range(options.repeats)]
-        first = seconds(surface.evaluate, *places[0])
-        again = min(seconds(surface.evaluate, *where) for where in places)
+        surface, rng, clock = msub.LimitSurface(msub.ControlCage.from_file(path)), np.random.default_rng(0), Clock()
+        classes, points = surface.patches.class_count, surface.cage.positions
+        for _ in range(options.repeats):
+            where = random_locations(surface, rng, options.samples)
+            clock.lap()
+            surface.evaluate(*where)
+            clock.lap("samples")
         table = surface.sampling(options.rate)
-        vertex_count = len(table.apply(surface.cage.positions)[0])
-        vertices = min(seconds(table.apply, surface.cage.positions) for _ in places)
-        sample, vertex = again / options.samples, vertices / vertex_count
+        vertex_count = len(table.apply(points)[0])
+        for _ in range(options.repeats):
+            clock.lap()
+            table.apply(points)
+            clock.lap("vertices")
+        first, *again = (processor for _, processor, _ in clock.laps["samples"])
+        sample = min(again) / options.samples
+        vertex = min(processor for _, processor, _ in clock.laps["vertices"]) / vertex_count
         print(
             f"{path.stem}, {surface.patches.patch_count} patches, {classes} classes: first {1e3 * first:.0f} ms; again "
             f"{1e6 * sample:.2f} us a sample, {sample / vertex:.1f} times a vertex of the tessellation"
@@ -45,13 +50,6 @@ def random_locations(surface, rng, count):
     element = rng.choice(np.flatnonzero(elements.face_sizes), count)
     uv = domain.from_square(rng.random((count, 2)))
     return element, uv, rng.integers(0, elements.face_sizes[element])
-
-
-def seconds(work, *arguments):
-    """Of the processor, that some work takes."""
-    begin = time.process_time()
-    work(*arguments)
-    return time.process_time() - begin
 
 
 if __name__ == "__main__":

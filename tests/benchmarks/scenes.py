@@ -15,10 +15,7 @@ other programs run beside; "next" is the best of some repeats. Only the ratios w
 """
 
 import argparse
-import json
-import sys
 import tempfile
-from functools import partial
 from pathlib import Path
 
 # Before Dr.Jit, so that it finds an LLVM library that works; it registers the shape, too.
@@ -29,9 +26,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision.device_arrays import upload
-from processes import ROOT, Clock, measured
+from processes import ROOT, measured_from_empty_cache, print_row, run
 
-VARIANT = "llvm_ad_rgb"
 SHADINGS = ("vertex", "exact")
 # Segments on each edge with which the surface looks alike.
 RATES = {"vertex": 8, "exact": 2}
@@ -40,83 +36,70 @@ SIX_CAGES = ("rook", "human", "star", "jar", "barrel", "propeller")
 GROWTH = ((50, 50, 1), (100, 100, 1), (200, 200, 1), (100, 100, 10), (100, 200, 10), (100, 200, 20), (200, 400, 20))
 COPIES = (400, 1_000, 5_000, 20_000)
 FEW, MANY = 6, 42
-STEPS = ("load", "first", "next")
 
 
-def main(arguments=None):
-    options = _parsed(arguments)
-    if options.process:
-        task, shading, words, repeats = json.loads(options.process)
-        mi.set_variant(VARIANT)
-        print(json.dumps(TASKS[task][0](shading, repeats, *words)))
-        return
-    for task in options.tasks or TASKS:
-        runs = []
-        for words in TASKS[task][1](options):
-            runs.append({shading: _measured(task, shading, words, options.repeats) for shading in SHADINGS})
-            _show(f"{task} {' '.join(map(str, words))}", runs[-1])
-        if task == "shapes":
-            _show_further(*runs)
-
-
-def _parsed(arguments):
+def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("tasks", nargs="*", metavar="TASK", help=f"of {', '.join(TASKS)}; all of them")
     parser.add_argument("--cages", nargs="+", default=["rook", "human", "star"], help="of scenes/cages")
     parser.add_argument("--growth", nargs="+", type=_counts, default=GROWTH, metavar="SHAPES,INSTANCES,GROUPS")
     parser.add_argument("--copies", nargs="+", type=int, default=COPIES)
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--process", help=argparse.SUPPRESS)
-    options = parser.parse_args(arguments)
+    options = parser.parse_args()
     if wrong := set(options.tasks) - TASKS.keys():
         parser.error(f"there is no task {', '.join(sorted(wrong))}; expected some of {', '.join(TASKS)}")
-    return options
+    for name in options.tasks or TASKS:
+        (work, cases), taken = TASKS[name], []
+        for words in cases(options):
+            runs = {
+                shading: measured_from_empty_cache(work, shading, options.repeats, *words, times=2)
+                for shading in SHADINGS
+            }
+            taken.append(runs)
+            _show(f"{name} {' '.join(map(str, words))}", runs)
+        if work is shapes:
+            _show_further(*taken)
 
 
 def _counts(text):
     return tuple(map(int, text.split(",")))
 
 
-def _measured(task, shading, words, repeats):
-    """What a process with an empty cache of kernels has measured, and one after it."""
-    with tempfile.TemporaryDirectory() as home:
-        # Dr.Jit keeps compiled kernels at home.
-        command = [sys.executable, __file__, "--process", json.dumps([task, shading, words, repeats])]
-        return [measured(f"{task}, {shading}", command, HOME=home) for _ in ("cold", "warm")]
+def _seconds(run):
+    """Wall and processor seconds of each lap, the least of its times."""
+    return {name: np.min(laps, axis=0)[:2] for name, laps in run["laps"].items()}
 
 
 def _show(title, runs):
-    print(f"\n{title:<32}" + "".join(f"{name:>20}" for name in (*SHADINGS, "ratio")) + "    wall s (CPU s)")
-    for number, cache in enumerate(("empty cache", "compiled")):
-        vertex, exact = (runs[shading][number] for shading in SHADINGS)
-        for step in vertex["seconds"]:
-            columns = np.array([vertex["seconds"][step], exact["seconds"][step]])
-            columns = [*columns, columns[1] / np.maximum(columns[0], 1e-9)]
-            print(f"  {f'{cache}: {step}':<30}" + "".join(f"{wall:10.4f} ({cpu:7.4f})" for wall, cpu in columns))
-        print(f"  {f'{cache}: memory, MB':<30}" + "".join(f"{run['memory']:20.0f}" for run in (vertex, exact)))
-    sys.stdout.flush()
+    print()
+    print_row(title, *SHADINGS, "ratio", "wall s (CPU s)")
+    for cache, vertex, exact in zip(("empty cache", "compiled"), *runs.values(), strict=True):
+        slow = _seconds(exact)
+        for name, seconds in _seconds(vertex).items():
+            columns = seconds, slow[name], slow[name] / np.maximum(seconds, 1e-9)
+            print_row(f"  {cache}: {name}", *(f"{wall:.4f} ({processor:7.4f})" for wall, processor in columns))
+        print_row(f"  {cache}: memory, MB", *(f"{run['peak']:.0f}" for run in (vertex, exact)))
 
 
 def _show_further(few, many):
     """What each of the further shapes costs, with compiled kernels."""
     for shading in SHADINGS:
         (_, less), (_, more) = few[shading], many[shading]
-        times = ((more["seconds"][step][0] - less["seconds"][step][0]) / (MANY - FEW) * 1e3 for step in STEPS)
-        steps = ", ".join(f"{step} {milliseconds:.1f} ms" for step, milliseconds in zip(STEPS, times, strict=True))
-        memory = (more["memory"] - less["memory"]) / (MANY - FEW)
-        print(f"  each further shape, {shading}: {steps}, {memory:.1f} MB")
+        begun, ended = _seconds(less), _seconds(more)
+        times = ", ".join(f"{name} {(ended[name] - begun[name])[0] / (MANY - FEW) * 1e3:.1f} ms" for name in begun)
+        print(f"  each further shape, {shading}: {times}, {(more['peak'] - less['peak']) / (MANY - FEW):.1f} MB")
 
 
-def hits(shading, repeats, cage):
+def hits(clock, shading, repeats, cage):
     shape = _shape(cage, shading, RATES[shading], bsdf={"type": "roughconductor", "alpha": 0.2})
-    return _pictures(_scene({"shape": shape}, 256, 64), repeats)
+    _pictures(clock, _scene({"shape": shape}, 256, 64), repeats)
 
 
-def shapes(shading, repeats, count):
-    return _pictures(_scene(_spread(shading, SIX_CAGES, count), 64, 4), repeats)
+def shapes(clock, shading, repeats, count):
+    _pictures(clock, _scene(_spread(shading, SIX_CAGES, count), 64, 4), repeats)
 
 
-def instances(shading, repeats, shape_count=7, instance_count=64, group_count=1, *, samples=4):
+def instances(clock, shading, repeats, shape_count=7, instance_count=64, group_count=1, *, samples=4):
     """Shapes and instances of one cage, the latter of several groups in turn."""
     placed = list(_spread(shading, ["star"], shape_count + instance_count).items())
     entries = dict(placed[:shape_count])
@@ -126,18 +109,22 @@ def instances(shading, repeats, shape_count=7, instance_count=64, group_count=1,
     for number, (name, shape) in enumerate(placed[shape_count:]):
         group = {"type": "ref", "id": f"group_{number % group_count}"}
         entries[f"of_{name}"] = {"type": "instance", "group": group, "to_world": shape["to_world"]}
-    return _pictures(_scene(entries, 64, samples), repeats)
+    _pictures(clock, _scene(entries, 64, samples), repeats)
 
 
-def copies(shading, repeats, count):
+def growth(clock, shading, repeats, *counts):
+    instances(clock, shading, repeats, *counts, samples=1)
+
+
+def copies(clock, shading, repeats, count):
     """A stage of so many copies in a square, turned at random."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "copies.usdc"
         _write_copies(path, msub.ControlCage.from_file(ROOT / "scenes/cages/rook.obj"), count)
-        clock = Clock()
+        clock.lap()
         scene = msub.usd_scene(path, mi, spp=4, shading=shading)
         clock.lap("read")
-        return _pictures(scene, repeats, clock)
+        _pictures(clock, scene, repeats)
 
 
 def _write_copies(path, cage, count):
@@ -162,9 +149,10 @@ def _write_copies(path, cage, count):
     stage.Save()
 
 
-def gradients(shading, repeats, cage):
+def gradients(clock, shading, repeats, cage):
     """A step of a fit: render, differentiate by control points, update."""
-    clock, shape = Clock(), _shape(cage, shading, RATES[shading], bsdf={"type": "diffuse"})
+    shape = _shape(cage, shading, RATES[shading], bsdf={"type": "diffuse"})
+    clock.lap()
     scene = mi.load_dict(_scene({"shape": shape}, 128, 16, {"type": "prb", "max_depth": 3}))
     parameters = mi.traverse(scene)
     (key,) = (key for key in parameters.keys() if key.endswith("control_points"))  # noqa: SIM118
@@ -179,34 +167,28 @@ def gradients(shading, repeats, cage):
         dr.backward(dr.mean(mi.render(scene, parameters, seed=step, spp=16) ** 2, axis=None))
         dr.eval(dr.grad(moved))
         dr.sync_thread()
-        clock.lap("first" if step == 0 else "next")
-    return _taken(clock)
+        clock.lap("next" if step else "first")
 
 
 TASKS = {
     "hits": (hits, lambda options: [[cage] for cage in options.cages]),
     "shapes": (shapes, lambda _: [[FEW], [MANY]]),
     "instances": (instances, lambda _: [[]]),
-    "growth": (partial(instances, samples=1), lambda options: options.growth),
+    "growth": (growth, lambda options: options.growth),
     "copies": (copies, lambda options: [[count] for count in options.copies]),
     "gradients": (gradients, lambda options: [[cage] for cage in options.cages]),
 }
 
 
-def _pictures(scene, repeats, clock=None):
+def _pictures(clock, scene, repeats):
     """A scene, loaded, and pictures of it."""
-    clock = clock or Clock()
+    clock.lap()
     loaded = mi.load_dict(scene)
     dr.sync_thread()
     clock.lap("load")
     for number in range(repeats + 1):
         np.array(mi.render(loaded, seed=number))
-        clock.lap("first" if number == 0 else "next")
-    return _taken(clock)
-
-
-def _taken(clock):
-    return {"seconds": clock.seconds, "memory": clock.peak}
+        clock.lap("next" if number else "first")
 
 
 def _scene(shapes, size, spp, integrator=None):
@@ -247,4 +229,4 @@ def _shape(cage, shading, rate, *, scale=1.0, place=(0, 0, 0), bsdf=None):
 
 
 if __name__ == "__main__":
-    main()
+    run(main, *(work for work, _ in TASKS.values()), variant="llvm_ad_rgb")

@@ -15,36 +15,23 @@ kernels are in Dr.Jit's cache. Times are the best of the repeats.
 import argparse
 import json
 import os
-import subprocess
-import sys
 import tempfile
 import time
 import warnings
 from pathlib import Path
 
 import numpy as np
+from processes import PROCESS, measured, print_row, printed, ran, run
 
 CYCLES = Path(__file__).with_name("cycles_stage.py")
 SHADINGS = ("vertex", "exact")
-STAGES = ("imports", "read", "load", "first picture", "program to picture", "file to picture", "next picture")
+LAPS = ("imports", "read", "load", "first picture", "next picture")
+# The laps of each row.
+ROWS = {name: [name] for name in LAPS[:-1]}
+ROWS |= {"program to picture": LAPS[:4], "file to picture": LAPS[1:4], "next picture": LAPS[4:]}
 
 
-def main(arguments=None):
-    options = _parsed(arguments)
-    if not options.stage.is_file():
-        raise SystemExit(f'"{options.stage}": there is no such file; expected a USD stage, such as chess_set.usda')
-    if options.process:
-        print(json.dumps(_own(options)))
-        return
-    sides = {shading: [sys.executable, __file__, "--process", shading] for shading in SHADINGS}
-    if reason := _no_cycles(options.cycles):
-        print(f"Cycles: left out, {reason}")
-    else:
-        sides["cycles"] = [options.cycles, CYCLES]
-    _show(_measured(sides, options))
-
-
-def _parsed(arguments):
+def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("stage", type=Path)
     parser.add_argument("--cycles", metavar="PYTHON", help="a Python that has the module bpy")
@@ -52,8 +39,13 @@ def _parsed(arguments):
     parser.add_argument("--spp", type=int, default=16)
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--grey", action="store_true", help="leave out the materials, on both sides")
-    parser.add_argument("--process", choices=SHADINGS, help=argparse.SUPPRESS)
-    return parser.parse_args(arguments)
+    options = parser.parse_args()
+    if not options.stage.is_file():
+        raise SystemExit(f'"{options.stage}": there is no such file; expected a USD stage, such as chess_set.usda')
+    reason = _no_cycles(options.cycles)
+    if reason:
+        print(f"Cycles: left out, {reason}")
+    _show(_best(options, [*SHADINGS, "cycles"][: 2 if reason else 3]))
 
 
 def without_materials(path, copy):
@@ -81,17 +73,15 @@ def _no_cycles(python):
     """Why Cycles cannot be measured; None if it can."""
     if python is None:
         return "no --cycles PYTHON was given; expected one with `pip install bpy==5.0.1`"
-    done = subprocess.run([python, "-c", "import bpy"], capture_output=True, text=True, check=False)
+    done = ran([python, "-c", "import bpy"], PYTHONPATH=None)
     return f"{python} has no module bpy; expected `pip install bpy==5.0.1`" if done.returncode else None
 
 
-def _measured(sides, options):
-    """By side, the best wall and processor seconds of each stage, and the peak of memory in MB."""
-    from processes import measured
-
-    runs = {name: [] for name in sides}
+def _best(options, sides):
+    """By side, the best wall and processor seconds of each row, and the peak of memory in MB."""
+    runs, camera = {name: [] for name in sides}, None
     with tempfile.TemporaryDirectory() as folder:
-        stage, camera = options.stage, Path(folder) / "camera.json"
+        stage = options.stage
         if options.grey:
             stage = without_materials(stage.resolve(), Path(folder) / "grey.usda")
         # Modules that are imported later are compiled once, as in an installation.
@@ -99,71 +89,64 @@ def _measured(sides, options):
         os.environ["PYTHONPYCACHEPREFIX"] = folder
         # The first round compiles kernels and modules, and reads files into memory.
         for number in range(options.repeats + 1):
-            for name, command in sides.items():
-                is_cycles, begun = name == "cycles", repr(time.monotonic())
-                rest = [camera] if is_cycles else ["--size", *options.size, "--spp", options.spp]
-                variables = {"PYTHONPATH": None} if is_cycles else {}
-                run = measured(name, [*command, stage, *rest], BEGUN=begun, **variables)
+            for name in sides:
+                begun = repr(time.monotonic())
+                if name == "cycles":
+                    words = json.dumps([str(stage), camera])
+                    taken = printed([options.cycles, CYCLES, PROCESS, name, words], PYTHONPATH=None, BEGUN=begun)
+                else:
+                    taken = measured(package, stage, options.size, options.spp, name, BEGUN=begun)
+                    camera = taken["camera"]
                 if number:
-                    runs[name].append(run)
-                if not is_cycles:
-                    camera.write_text(json.dumps(run["camera"] | {"spp": options.spp}))
+                    runs[name].append(taken)
     return {
-        name: {
-            "seconds": {stage: np.min([run["seconds"][stage] for run in its_runs], axis=0) for stage in STAGES},
-            "memory": max(run["memory"] for run in its_runs),
-        }
+        name: {row: np.min([_sum(taken, laps) for taken in its_runs], axis=0) for row, laps in ROWS.items()}
+        | {"memory": max(taken["peak"] for taken in its_runs)}
         for name, its_runs in runs.items()
     }
 
 
+def _sum(taken, laps):
+    return np.sum([taken["laps"][name][0][:2] for name in laps], axis=0)
+
+
 def _show(best):
-    print(" " * 20 + "".join(f"{name:>22}" for name in best) + "    wall s (CPU s)")
-    for stage in STAGES:
-        columns = (side["seconds"][stage] for side in best.values())
-        print(f"{stage:<20}" + "".join(f"{wall:13.2f} ({processor:6.2f})" for wall, processor in columns))
-    print(f"{'peak memory, MB':<20}" + "".join(f"{side['memory']:22.0f}" for side in best.values()))
-    for name in (name for name in best if name != "exact"):
-        exact, other = (best[side]["seconds"] for side in ("exact", name))
-        ratios = ((stage, *(exact[stage] / other[stage])) for stage in STAGES[-3:])
-        print(f"exact / {name}: " + ", ".join(f"{stage} {wall:.2f} (CPU {cpu:.2f})" for stage, wall, cpu in ratios))
+    print_row("", *best, "wall s (CPU s)")
+    for row in ROWS:
+        print_row(row, *("{:.2f} ({:6.2f})".format(*side[row]) for side in best.values()))
+    print_row("peak memory, MB", *(f"{side['memory']:.0f}" for side in best.values()))
+    for name, other in best.items():
+        if name != "exact":
+            ratios = {row: best["exact"][row] / other[row] for row in [*ROWS][-3:]}
+            told = (f"{row} {wall:.2f} (CPU {processor:.2f})" for row, (wall, processor) in ratios.items())
+            print(f"exact / {name}: {', '.join(told)}")
 
 
-def _own(options):
-    """Seconds of this package in this process, and its camera."""
+def package(clock, path, size, spp, shading):
+    """A stage from its reading to two pictures by this package; returns the camera, for Cycles."""
     # Before Dr.Jit, so that it finds an LLVM library that works.
     import mitsuba_subdivision as msub  # isort: skip
     import drjit as dr
     import mitsuba as mi
-    from processes import peak_memory
 
     mi.set_variant("llvm_ad_rgb")
-    clock = [(float(os.environ["BEGUN"]), 0.0), (time.monotonic(), time.process_time())]
-
-    def lap():
-        dr.sync_thread()
-        clock.append((time.monotonic(), time.process_time()))
-
+    clock.lap("imports")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", msub.CageWarning)
-        scene = msub.usd_scene(options.stage, mi, size=tuple(options.size), spp=options.spp, shading=options.process)
-        lap()
+        scene = msub.usd_scene(path, mi, size=tuple(size), spp=spp, shading=shading)
+        clock.lap("read")
         # In order, so that the kernels of instances are those of the first round.
         loaded = mi.load_dict(scene, parallel=False)
-    lap()
+        dr.sync_thread()
+    clock.lap("load")
     max_depth = scene["integrator"]["max_depth"]
     del scene
-    for seed in range(2):
+    for seed, name in enumerate(LAPS[3:]):
         np.array(mi.render(loaded, seed=seed))
-        lap()
-    laps = "imports", "read", "load", "first picture", "next picture"
-    seconds = dict(zip(laps, np.diff(clock, axis=0).tolist(), strict=True))
-    seconds["program to picture"] = np.subtract(clock[4], clock[0]).tolist()
-    seconds["file to picture"] = np.subtract(clock[4], clock[1]).tolist()
-    memory = peak_memory()
+        clock.lap(name)
     from pxr import Usd, UsdGeom, UsdLux
 
-    sensor, stage = loaded.sensors()[0], Usd.Stage.Open(str(options.stage))
+    sensor, stage = loaded.sensors()[0], Usd.Stage.Open(path)
     seen = mi.traverse(sensor)
     domes = (UsdLux.DomeLight(prim) for prim in stage.Traverse() if prim.IsA(UsdLux.DomeLight))
     domes = [dome.GetTextureFileAttr().Get() for dome in domes]
@@ -173,13 +156,14 @@ def _own(options):
         # Radius and distance in focus, with depth of field.
         "lens": [float(seen[name][0]) for name in ("aperture_radius", "focus_distance") if name in seen],
         "dome": next((dome.resolvedPath for dome in domes if dome and dome.resolvedPath), None),
-        "size": list(options.size),
+        "size": size,
+        "spp": spp,
         "is_open": loaded.environment() is not None,
         "max_depth": max_depth,
         "up": str(UsdGeom.GetStageUpAxis(stage)).lower(),
     }
-    return {"seconds": seconds, "memory": memory, "camera": camera}
+    return {"camera": camera}
 
 
 if __name__ == "__main__":
-    main()
+    run(main, package)
