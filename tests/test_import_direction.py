@@ -16,7 +16,7 @@ from scipy import sparse
 PACKAGE = "mitsuba_subdivision"
 ROOT, WHOLE_FILES = (Path(package.__file__).parent for package in (mitsuba_subdivision, mitsuba_usd))
 # Modules that import by names which are no constants: of modules of their own package, or of a user.
-BY_NAME = {"deferred.py", "commands/__init__.py", "files/formats.py", "figures/__init__.py"}
+BY_NAME = {"__init__.py", "commands/__init__.py", "files/formats.py", "figures/__init__.py"}
 # Packages that may import a library that the numpy packages do without.
 MAY_IMPORT = {
     "mitsuba": {"variants", "mitsuba_mesh", "shapes", "fit", "regression", "figures", "studio", "doctor", "commands"},

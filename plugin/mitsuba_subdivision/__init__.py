@@ -8,7 +8,6 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from .deferred import deferred
 from .llvm import select_llvm
 
 # Before Mitsuba loads Dr.Jit, which takes the first LLVM library it meets.
@@ -71,21 +70,22 @@ __all__ = [
 
 # Imported when first used, so that a scene without subdivision surfaces does not wait for them.
 _NAMES = {
-    "cage": ("Attribute", "CageError", "CageWarning", "ControlCage"),
-    "device_arrays": ("upload",),
-    "evaluation.element": ("limit_stencil",),
-    "evaluation.scheme_laws": ("check_scheme",),
-    "patches.area_samples": ("AreaSamples",),
-    "patches.closest_points": ("ClosestPoints",),
-    "patches.patch_samples": ("StencilMatrices",),
-    "patches.polynomial_pieces": ("ElementBounds",),
-    "refinement.cage_refinement": ("CageRefinement",),
-    "schemes": ("SchemeError", "register_scheme"),
-    "shapes.derivatives": ("loss_of_views",),
-    "shapes.parameters": ("pixel_error_for",),
-    "studio": ("render_denoised", "studio_scene"),
-    "surface": ("LimitSurface", "SurfaceSamples"),
-    "tessellation.vertex_table": ("Tessellation", "VertexMatrices"),
+    ".cage": ("Attribute", "CageError", "CageWarning", "ControlCage"),
+    ".device_arrays": ("upload",),
+    ".evaluation.element": ("limit_stencil",),
+    ".evaluation.scheme_laws": ("check_scheme",),
+    ".patches.area_samples": ("AreaSamples",),
+    ".patches.closest_points": ("ClosestPoints",),
+    ".patches.patch_samples": ("StencilMatrices",),
+    ".patches.polynomial_pieces": ("ElementBounds",),
+    ".refinement.cage_refinement": ("CageRefinement",),
+    ".schemes": ("SchemeError", "register_scheme"),
+    ".shapes.derivatives": ("loss_of_views",),
+    ".shapes.parameters": ("pixel_error_for",),
+    ".studio": ("render_denoised", "studio_scene"),
+    ".surface": ("LimitSurface", "SurfaceSamples"),
+    ".tessellation.vertex_table": ("Tessellation", "VertexMatrices"),
+    "mitsuba_usd": ("usd_scene",),
 }
 
 
@@ -118,13 +118,14 @@ def example_file(name: str) -> str:
     raise FileNotFoundError(f'there is no example "{name}", neither in {folders}')
 
 
-_deferred = deferred(__name__, _NAMES)
-
-
 def __getattr__(name: str) -> object:
-    if name == "usd_scene":
-        return importlib.import_module("mitsuba_usd").usd_scene
-    return importlib.import_module(".fit", __name__) if name == "fit" else _deferred(name)
+    if name == "fit":
+        return importlib.import_module(".fit", __name__)
+    for module, names in _NAMES.items():
+        if name in names:
+            globals()[name] = getattr(importlib.import_module(module, __name__), name)
+            return globals()[name]
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

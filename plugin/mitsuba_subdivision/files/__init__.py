@@ -1,25 +1,18 @@
 """Readers and writers of files: OBJ, PLY and USD. Public names are parts of the reader of USD meshes."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from ..deferred import deferred
-
-if TYPE_CHECKING:
-    from .usd_reader import MeshReader, reversed_order
-    from .usd_skinning import Skinning
-    from .usd_stage import (
-        HIDDEN_PURPOSES,
-        local_to_world,
-        open_stage,
-        require_types,
-        require_usd,
-        time_of,
-        usd_errors_at,
-        usd_messages_of,
-        value_at,
-    )
+from .usd_reader import MeshReader, reversed_order
+from .usd_skinning import Skinning
+from .usd_stage import (
+    HIDDEN_PURPOSES,
+    local_to_world,
+    open_stage,
+    require_types,
+    require_usd,
+    time_of,
+    usd_errors_at,
+    usd_messages_of,
+    value_at,
+)
 
 __all__ = [
     "HIDDEN_PURPOSES",
@@ -35,7 +28,3 @@ __all__ = [
     "usd_messages_of",
     "value_at",
 ]
-
-_OF_READER = {"usd_reader": ("MeshReader", "reversed_order"), "usd_skinning": ("Skinning",)}
-# Cages of other formats do not wait for these.
-__getattr__ = deferred(__name__, {"usd_stage": __all__, **_OF_READER})

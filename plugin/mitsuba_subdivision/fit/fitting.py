@@ -36,17 +36,7 @@ Schedulable = float | Sequence[tuple[float, float]] | Callable[[int], float]
 
 
 class Fit(ABC):
-    """A fit, step by step.
-
-    Parameters
-    ----------
-    cage : ControlCage
-        Where to begin. Its topology, tags and rules stay, but for refinement.
-    scheme : str or None
-    refine : sequence of int, or int
-        Steps before which the cage is refined; or how often, each time when the loss has stopped falling.
-    callbacks : sequence of callable
-        Called with the fit after each step.
+    """A fit, step by step: the base of `CageFit` and `PointFit`, which have these parameters.
 
     Attributes
     ----------

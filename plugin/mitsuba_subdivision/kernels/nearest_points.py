@@ -54,10 +54,9 @@ class NearestPoints:
 
 def nearest_locations(
     walk: ElementWalk,  # Elements of the surface
-    piece_at: Callable[..., Piece],  # Function of a half-edge, u, v and a mask, which returns the detached piece
+    piece_at: Callable[..., Piece],  # Function of a half-edge, u and v, which returns the detached piece
     p: Vector3,  # Detached
     start: Location,
-    active: Mask = True,
 ) -> tuple[Location, NearestPoints]:
     """Find the locations nearest to points, seen from the first corner in whole elements."""
     types = walk.types
@@ -67,8 +66,8 @@ def nearest_locations(
 
     def step(steps_left, half_edge, u, v, squared_distance, du, dv, step_factor, *_):
         target = Location(half_edge, u + step_factor * du, v + step_factor * dv)
-        location = walk.carried(target, active)
-        piece = piece_at(location.half_edge, location.u, location.v, active)
+        location = walk.carried(target)
+        piece = piece_at(location.half_edge, location.u, location.v)
         values = piece.values(derivatives=2)
         offset = values.value - p
         new_squared = dr.squared_norm(offset)
@@ -93,11 +92,11 @@ def nearest_locations(
     zero = types.float(0)
     state = (types.index(STEPS), start.half_edge, start.u, start.v, zero + dr.inf, zero, zero, zero + 1)
     _, half_edge, u, v, *_ = dr.while_loop(
-        state, lambda steps_left, *_: active & (steps_left > 0), step, mode="symbolic", label="nearest_location"
+        state, lambda steps_left, *_: steps_left > 0, step, mode="symbolic", label="nearest_location"
     )
     # One more step, which is not taken, determines the directions in which the final location may move.
-    location, _ = walk.from_first(Location(half_edge, u, v), active)
-    values = piece_at(location.half_edge, location.u, location.v, active).values(derivatives=2)
+    location, _ = walk.from_first(Location(half_edge, u, v))
+    values = piece_at(location.half_edge, location.u, location.v).values(derivatives=2)
     _, _, along_u, along_v, is_free = _step(walk, location, values, values.value - p)
     return location, NearestPoints(p, along_u, along_v, is_free)
 

@@ -156,10 +156,8 @@ class ParameterDomain:
         return np.stack([u, v], axis=1), products
 
 
-@lru_cache(maxsize=32)
-def _gauss(order: int) -> tuple[FloatArray, FloatArray]:
-    """Return Gauss-Legendre nodes and weights on [-1, 1]; cached, as they need an eigenvalue problem."""
-    return np.polynomial.legendre.leggauss(order)
+# Nodes and weights on [-1, 1], which need an eigenvalue problem.
+_gauss = lru_cache(maxsize=32)(np.polynomial.legendre.leggauss)
 
 
 def _halved(sign: float, offset: tuple[float, float]) -> ParameterMap:
