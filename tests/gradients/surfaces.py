@@ -6,12 +6,12 @@ from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from patches.closed_cages import bumpy, cage_of, cube_with_hexagon
 from reference.refined_cages import refine_first
-from shapes.cages import RING, cube
+from shapes.cages import ISLANDS, RING, cube
 
 
 def ring_of(sharpness):
-    """A cube with a ring of creases around a face."""
-    return LimitSurface(bumpy(cube(creases=[(a, b, sharpness) for a, b, _ in RING])))
+    """A cube with a ring of creases around a face, and a seam of texture coordinates along each edge."""
+    return LimitSurface(bumpy(cube(creases=[(a, b, sharpness) for a, b, _ in RING], texcoords=ISLANDS)))
 
 
 def refined_first():

@@ -25,10 +25,16 @@ def moving(scene, positions, samples=SAMPLES, seeds=6):
     return Pictures(scene, {POINTS: positions}, samples, seeds)
 
 
-@pytest.mark.parametrize("name", [name for name in SURFACES if name != "semi-sharp"])
-def test_gradients_of_outlines_are_those_of_the_area_covered(name):
+@pytest.mark.parametrize(
+    ("name", "shading"),
+    [
+        *((name, "vertex") for name in SURFACES if name != "semi-sharp"),
+        pytest.param("creased", "exact", marks=exact),
+    ],
+)
+def test_gradients_of_outlines_are_those_of_the_area_covered(name, shading):
     surface = SURFACES[name]()
-    gradients = moving(outline_of(surface), surface.cage.positions).gradients()
+    gradients = moving(outline_of(surface, shading=shading), surface.cage.positions).gradients()
     # No outline changes by more than its own size.
     largest = np.abs(surface.cage.positions).max()
     ways = {key: way * largest / np.abs(way).max() for key, way in motions(surface).items()}

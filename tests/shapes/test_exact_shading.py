@@ -11,7 +11,7 @@ from patches.closed_cages import cube_with_hexagon, extraordinary_triangles, tet
 from reference.refined_cages import sheet
 from scipy import ndimage
 from shapes.cages import RING, cube, described, textured
-from shapes.scenes import perspective, rays, rows, scene_with
+from shapes.scenes import camera_rays, perspective, rays, rows, scene_with
 from shapes.variants import llvm
 
 if hook_problem():
@@ -48,7 +48,6 @@ SURFACES = {
     "textured": (textured, "catmull_clark"),
     "plane": (lambda: sheet(2, 2), "catmull_clark"),
     "far": (lambda: cube().with_positions(cube().positions + 1000), "catmull_clark"),
-    "valence 5": (lambda: named_cages.extraordinary(5), "catmull_clark"),
     "dome": (lambda: named_cages.extraordinary(7, closed=False), "catmull_clark"),
     "mixed": (cube_with_hexagon, "catmull_clark"),
     "crease": (lambda: cube(creases=RING), "catmull_clark"),
@@ -62,11 +61,6 @@ EYE = (2.2, -3.2, 2.0)
 
 def sensor(origin=EYE, target=(0, 0, 0), fov=30, resolution=RESOLUTION):
     return perspective(resolution, origin, target, fov=fov)
-
-
-def camera_rays(resolution=RESOLUTION, **view):
-    y, x = (np.indices((resolution, resolution)).reshape(2, -1) + 0.5) / resolution
-    return mi.load_dict(sensor(resolution=resolution, **view)).sample_ray(0, 0.5, mi.Point2f(x, y), mi.Point2f(0.5))[0]
 
 
 def scene_of(shape, integrator="direct", light=None, view=None, **more):
@@ -107,10 +101,10 @@ def inside(si, other, resolution=RESOLUTION):
 # Hits
 
 
-TRIANGLES = [*({"tessellation_rate": rate} for rate in (FINE, 1, 2)), {"tessellation": "adaptive", "max_edge": 0.5}]
+TRIANGLES = [{"tessellation_rate": FINE}, {"tessellation_rate": 1}, {"tessellation": "adaptive", "max_edge": 0.5}]
 
 
-@pytest.mark.parametrize("name", [*list(SURFACES)[4:-2], "Doo-Sabin tetrahedron"])
+@pytest.mark.parametrize("name", ["dome", "mixed", "crease", "Loop ball", "Doo-Sabin tetrahedron"])
 def test_normals_do_not_depend_on_the_tessellation(name):
     cage, scheme = SURFACES[name]
     shapes = (described(cage(), shading="exact", scheme=scheme, **triangles) for triangles in TRIANGLES)
@@ -131,8 +125,8 @@ MIRRORED = np.diag([-1, 1, 1, 1]) @ SHEARED
 @pytest.mark.parametrize(
     ("name", "matrix", "flips"),
     [
-        ("cube", np.eye(4), False),
-        ("cube", MIRRORED, True),
+        ("semi-sharp", np.eye(4), False),
+        ("crease", MIRRORED, True),
         ("far", np.eye(4), False),
         ("textured", SHEARED, False),
         ("plane", np.eye(4), True),
@@ -217,15 +211,14 @@ def matte():
     [
         ("cube", "direct", {"type": "point", "position": [-3, -1, 2.5], "intensity": 10.0}),
         ("Loop ball", "path", None),
-        ("Doo-Sabin tetrahedron", "direct", {"type": "directional", "direction": [1, 0.3, -0.4]}),
     ],
-    ids=["point", "sky", "directional"],
+    ids=["point", "sky"],
 )
 def test_no_facet_is_dark_on_a_convex_surface(name, integrator, light):
     cage, scheme = SURFACES[name]
     rates, given = (FINE, 1), {"scheme": scheme, "bsdf": matte()}
     shapes = (make(cage(), tessellation_rate=rate, **given) for rate in rates)
-    where = inside(*(hits(shape, camera_rays(), mi.RayFlags.All) for shape in shapes))
+    where = inside(*(hits(shape, camera_rays(RESOLUTION), mi.RayFlags.All) for shape in shapes))
     lit, seen = (
         picture.mean(axis=2).ravel()[where]
         for picture in images(rates, cage(), given, integrator, light or sky(), spp=64)
@@ -336,15 +329,6 @@ def test_materials_look_the_same_at_every_rate():
         assert (apart > 0.1).mean() < 0.02, name
 
 
-def test_materials_of_attributes_look_the_same_at_every_rate_in_spectral_variants(request):
-    request.getfixturevalue("variant_llvm_ad_spectral")
-    coloured = {"type": "diffuse", "reflectance": attribute("colour")}
-    bsdf = {"type": "blendbsdf", "weight": attribute("heat"), "one": coloured, "two": {"type": "diffuse"}}
-    coarse, fine = images((1, 32), cube(), {**heat_and_colour(), "bsdf": bsdf}, view={"fov": 12}, spp=8)
-    assert coarse.mean() == pytest.approx(fine.mean(), rel=ENERGY)
-    assert np.median(np.abs(coarse - fine)) < 1e-3
-
-
 def light():
     return {"type": "area", "radiance": rgb(1, 1, 1)}
 
@@ -382,24 +366,24 @@ def test_attributes_are_those_of_the_surface_on_both_sides(eye, np_rng):
     assert np.median(np.abs(coarse - fine)[..., -3:]) < 1e-4
 
 
-FOG = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 1.0}
-
-
-@pytest.mark.parametrize(
-    ("matter", "integrator"),
-    [({"bsdf": {"type": "dielectric"}}, "path"), ({"bsdf": {"type": "null"}, "interior": FOG}, "volpath")],
-    ids=["glass", "fog"],
-)
-def test_light_passes_through(matter, integrator):
-    pictures = images((8, 32), cube(), matter, {"type": integrator, "max_depth": 8}, sky(), {"fov": 12}, spp=64)
+def test_light_passes_through():
+    """Glass and fog, side by side."""
+    fog, pictures = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 1.0}, []
+    for rate in (8, 32):
+        left, right = (mi.ScalarTransform4f().translate([x, 0, 0]) for x in (-0.8, 0.8))
+        glass = make(cube(), tessellation_rate=rate, bsdf={"type": "dielectric"}, to_world=left)
+        cloud = make(cube(), tessellation_rate=rate, bsdf={"type": "null"}, interior=fog, to_world=right)
+        scene = scene_of(glass, {"type": "volpath", "max_depth": 8}, sky(), {"fov": 24}, cloud=cloud)
+        pictures.append(np.array(mi.render(scene, spp=64, seed=1)))
     assert np.isfinite(pictures[0]).all()
-    assert pictures[0].mean() == pytest.approx(pictures[1].mean(), rel=2 * ENERGY)
+    for seen, fine in zip(*(np.split(picture, 2, axis=1) for picture in pictures), strict=True):
+        assert seen.mean() == pytest.approx(fine.mean(), rel=2 * ENERGY)
 
 
 @pytest.mark.parametrize(("kind", "tolerance"), [("instance", 10 * NORMAL), ("merge", NORMAL)])
 def test_instances_and_merged_shapes_are_met_as_others(kind, tolerance):
     to_world = mi.ScalarTransform4f().translate([1, 2, 3]).rotate([0.6, 0.8, 0], 50).scale([1, 0.6, 1.4])
-    seen_along = camera_rays(origin=(5, -4, 5), target=(1, 2, 3), fov=16)
+    seen_along = camera_rays(RESOLUTION, origin=(5, -4, 5), target=(1, 2, 3), fov=16)
     placed = make(cube(), to_world=to_world)
     if kind == "instance":
         instance = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world}
@@ -415,25 +399,16 @@ def test_instances_and_merged_shapes_are_met_as_others(kind, tolerance):
     np.testing.assert_allclose(rows(si.dp_du)[seen], rows(expected.dp_du)[seen], atol=DERIVATIVE)
 
 
-# Placement
-
-
 @pytest.mark.usefixtures("no_other_scene")
-@pytest.mark.parametrize("valence", [3, 5])
-def test_stams_form_goes_wrong_as_it_is_published(valence, np_rng):
-    cage, distance = named_cages.extraordinary(valence), 1e-3
+def test_stams_form_goes_wrong_as_it_is_published(np_rng):
+    cage, distance = named_cages.extraordinary(5), 1e-3
     surface, uv = LimitSurface(cage), distance * np_rng.uniform(0.5, 1, (400, 2))
     at = surface.evaluate(0, uv)
-
-    def errors(**options):
-        si = hits(make(cage, **options), rays(at.p + 0.1 * at.n, -at.n))
-        return np.linalg.norm(rows(si.sh_frame.n) - at.n, axis=1)
-
-    stabilized, stam = errors(), errors(evaluator="stam", sample_offset=distance)
     published = np.linalg.norm(surface.evaluate(0, uv, evaluator="stam", dtype=np.float32).n - at.n, axis=1)
+    stabilized, stam = (
+        np.linalg.norm(rows(hits(make(cage, **options), rays(at.p + 0.1 * at.n, -at.n)).sh_frame.n) - at.n, axis=1)
+        for options in ({}, {"evaluator": "stam", "sample_offset": distance})
+    )
     assert stabilized.max() < NORMAL
     assert 0.3 < np.median(stam) / np.median(published) < 3
     assert np.median(stam) > 3 * np.median(stabilized)
-
-
-# Gradients

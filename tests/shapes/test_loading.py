@@ -18,7 +18,7 @@ from patches.closed_cages import torus
 from reference.refined_cages import tagged
 from shapes.cages import RING, cube, described
 from shapes.updates import update
-from shapes.variants import every_array_variant, every_variant, exact, exact_llvm, llvm, scalar, shadings
+from shapes.variants import every_array_variant, every_variant, exact, llvm, scalar, shadings
 
 pytestmark = pytest.mark.threads
 
@@ -62,40 +62,31 @@ def load(shapes, **options):
     return mi.load_dict({"type": "scene", **named}, **options).shapes()
 
 
-def assert_as_if_alone(shape, shapes, i):
-    expected = buffers(mi.load_dict(placed(shape, i)))
-    loaded = buffers(shapes[i])
-    assert loaded.keys() == expected.keys()
-    for name, values in expected.items():
-        np.testing.assert_allclose(loaded[name], values, rtol=0, atol=SINGLE, err_msg=name)
+WAITING = [
+    {"shading": "exact"},
+    {"displacement": "vertex_height", "displacement_scale": 0.1},
+    {"displacement": {"type": "checkerboard"}, "shading": "exact"},
+    {"tessellation": "adaptive", "chord_error": 0.05},
+    {"evaluator": "stam", "sample_offset": 1e-3},
+]
 
 
 @llvm
-@pytest.mark.parametrize(("count", "parallel"), [(MANY, True), (SOME, False)], ids=["parallel", "one by one"])
-def test_many_shapes_load(count, parallel):
-    shape = of(cube())
-    shapes = load([shape] * count, parallel=parallel)
-    assert len(shapes) == count
-    for i in (0, count // 2, count - 1):
-        assert_as_if_alone(shape, shapes, i)
-
-
-@exact_llvm
-def test_what_waits_within_constructors_loads():
-    """All kinds inside each other."""
-    kinds = [
-        {"shading": "exact"},
-        {"displacement": "vertex_height", "displacement_scale": 0.1},
-        {"displacement": {"type": "checkerboard"}, "shading": "exact"},
-        {"tessellation": "adaptive", "chord_error": 0.05},
-        {"evaluator": "stam", "sample_offset": 1e-3},
-    ]
-    cage = coloured(cube(), height=np.linspace(0, 1, 8)[:, None])
-    shapes = [of(cage, **kinds[i % len(kinds)]) for i in range(SOME)]
-    loaded = load(shapes)
-    assert len(loaded) == SOME
-    for i in range(SOME - len(kinds), SOME):
-        assert_as_if_alone(shapes[i], loaded, i)
+@pytest.mark.parametrize(
+    ("count", "parallel", "kinds"),
+    [(MANY, True, [{}]), (SOME, False, [{}]), pytest.param(SOME, True, WAITING, marks=exact)],
+    ids=["parallel", "one by one", "what waits within constructors"],
+)
+def test_many_shapes_load(count, parallel, kinds):
+    cage = coloured(cube(), height=np.linspace(0, 1, 8)[:, None]) if len(kinds) > 1 else cube()
+    shapes = [of(cage, **kinds[i % len(kinds)]) for i in range(count)]
+    loaded = load(shapes, parallel=parallel)
+    assert len(loaded) == count
+    for i in (0, count // 2, *range(count - len(kinds), count)):
+        expected, buffers_ = buffers(mi.load_dict(placed(shapes[i], i))), buffers(loaded[i])
+        assert buffers_.keys() == expected.keys()
+        for name, values in expected.items():
+            np.testing.assert_allclose(buffers_[name], values, rtol=0, atol=SINGLE, err_msg=name)
 
 
 @llvm
@@ -184,8 +175,7 @@ def tables(shape):
 
 @every_variant
 @shadings
-@pytest.mark.parametrize("rate", [1, 3])
-def test_shapes_of_equal_topology_share_all_but_positions(shading, rate, tmp_path, np_rng):
+def test_shapes_of_equal_topology_share_all_but_positions(shading, tmp_path, np_rng):
     cage = coloured(cube())
     moved = cage.with_positions(cage.positions + np_rng.normal(size=cage.positions.shape) * 0.1)
     paths = [str(tmp_path / f"{name}.obj") for name in ("one", "other")]
@@ -193,7 +183,7 @@ def test_shapes_of_equal_topology_share_all_but_positions(shading, rate, tmp_pat
     for path, given in zip(paths, (cage, moved), strict=True):
         with pytest.warns(CageWarning, match="no place for attribute"):
             given.save(path)
-    options = {"shading": shading, "tessellation_rate": rate}
+    options = {"shading": shading, "tessellation_rate": 3}
     from_arrays = [mi.load_dict({**of(given), **options}) for given in (cage, moved, coloured(cage, 1))]
     files = [from_file(path, **options) for path in (*paths, paths[0])]
     for first, *others in (from_arrays, files):
@@ -206,7 +196,7 @@ def test_shapes_of_equal_topology_share_all_but_positions(shading, rate, tmp_pat
     assert files[0]._mesh.table is from_arrays[0]._mesh.table
 
 
-@every_variant
+@scalar
 @pytest.mark.parametrize(
     ("tags", "parameters"),
     [

@@ -12,8 +12,8 @@ from mitsuba_subdivision import CageWarning
 from patches.closed_cages import cube_with_hexagon
 from shapes.cages import ISLANDS, RING, bitmap, cube, described, load, with_attributes
 from shapes.scenes import buffer, perspective, scene_with
-from shapes.updates import derivative, differentiated, update
-from shapes.variants import every_ad_variant, exact, shadings
+from shapes.updates import differentiated, update
+from shapes.variants import every_ad_variant, exact
 
 pytestmark = every_ad_variant
 
@@ -243,24 +243,7 @@ def test_edges_between_copies_of_vertices_are_no_outlines():
     assert shape.vertex_count() > len(np.unique(positions, axis=0))
 
 
-# Those of vertices along a crease are in tests/gradients/test_outlines.py.
-@shadings
-def test_gradients_of_outlines_are_differences_where_vertices_have_copies(shading):
-    scene = views_of("direct_projective", SEAMED, shading=shading)
-    parameters = mi.traverse(scene)
-    start = mi.Float(parameters[KEY])
-
-    def mean():
-        return dr.mean(mi.render(scene, parameters, spp=512, seed=1), axis=None)
-
-    backward, difference = (
-        derivative(mode, lambda step: update(parameters, {KEY: start * (1 + step)}), mean, 0.02)
-        for mode in ("backward", "difference")
-    )
-    # Noise of about one per cent; with false outlines, 26 and 41 more.
-    assert backward == pytest.approx(difference, rel=0.03)
-
-
+# Gradients of outlines are in tests/gradients/test_outlines.py.
 def test_a_user_may_assign_other_triangles():
     shape = load(SEAMED, tessellation_rate=2)
     parameters = mi.traverse(shape)
