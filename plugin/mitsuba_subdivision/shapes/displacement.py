@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..device_arrays import mapped
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT
 from ..kernels.algebra import unit
-from ..kernels.array_types import ArrayTypes, Float, FloatBuffer, Mask, Value
+from ..kernels.array_types import Float, FloatBuffer, Mask, Value
 from ..kernels.channel_kernel import ChannelKernel
 from ..kernels.displacement import Displacement, Heights, displaced
 from ..kernels.linear_maps import SparseMatrix
@@ -58,7 +58,11 @@ _LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 
 class ShapeDisplacement:
-    """Displacement of a shape's surface: heights, their channel, and the scale.
+    """Displacement of a shape's surface and of its vertices: heights, their channel, and the scale.
+
+    Copies of a vertex along creases and seams are displaced by the mean of their displacements, so that they stay
+    bitwise equal. Each copy has the normal of its side. In JIT variants, differentiable with respect to control points,
+    the scale, and the texture or control values of the heights.
 
     Raises ValueError if the cage lacks the channel that heights depend on, or heights are not scalar.
     """
@@ -70,32 +74,56 @@ class ShapeDisplacement:
         positions: FloatArray,  # (n, 3) float64: control points, relative to the centre of `Placement`
         exact: ExactShading | None,  # Exact shading of the shape, whose surface is displaced, too
     ) -> None:
-        surface, given, scale = parameters.surface, parameters.displacement, parameters.displacement_scale
-        self._is_jit = dr.is_jit_v(variant.Float)
+        self._surface, given, scale = parameters.surface, parameters.displacement, parameters.displacement_scale
+        self._has_normals = exact is None and not parameters.face_normals
         # Name of the channel that the heights depend on: an attribute, or "texcoords".
-        self.attribute = _attribute_named(given, surface) if isinstance(given, str) else TEXCOORDS
-        if self.attribute not in surface.attribute_names:
+        self.attribute = _attribute_named(given, self._surface) if isinstance(given, str) else TEXCOORDS
+        if self.attribute not in self._surface.attribute_names:
             raise ValueError(
-                f"a texture was given, and {surface.cage.source.name} has no texture coordinates; expected a cage "
-                "with some, or the name of an attribute"
+                f"a texture was given, and {self._surface.cage.source.name} has no texture coordinates; expected a "
+                "cage with some, or the name of an attribute"
             )
         self.heights = Heights() if isinstance(given, str) else TextureHeights(variant, given)
         # The channel with its current values on the host; after an update, these are read when they are needed.
-        self._channel, self._updated = surface.channel(self.attribute), None
+        self._channel, self._updated = self._surface.channel(self.attribute), None
         # The parameter ``displacement_scale``: a flat array of one number.
         self.scale = flat_type(variant)([scale])
         # The displaced surface on the device, shared with exact shading; None in scalar variants.
         self.kernel: SurfaceKernel | None = None
         if exact is not None:
             self.kernel = exact.kernel
-        elif self._is_jit:
-            self.kernel = SurfaceKernel(surface.pieces(), variant.Float)
+        elif dr.is_jit_v(variant.Float):
+            self.kernel = SurfaceKernel(self._surface.pieces(), variant.Float)
             self.kernel.values.load(positions)
         if self.kernel is not None:
             channel = ChannelKernel(self._channel, variant.Float) if exact is None else exact.channels[self.attribute]
             self.kernel.displacement = Displacement(channel, self.heights, scale)
         self.require_scale()
         self.take_scale()
+
+    def set_triangles(
+        self,
+        layout: AttributeLayout,  # Vertices with copies along all seams, whose different displacements are averaged
+        weld_target: NDArray[np.uint32] | None,  # Their `split_weld_targets`
+    ) -> None:
+        """Set the vertices of the shape."""
+        # (n,) int64: corner of an element from which parameters are seen, a half-edge of `PatchTable.elements`; and
+        # (n, 2) float64: parameters. Samples at corners of elements have (0, 0).
+        self._corner, self._uv = corner, uv = layout.locate()
+        self._mean: Any = None if weld_target is None else _mean_over_copies(weld_target)
+        # (n,) bool: whether the slope of heights along the surface exists. It does not exist at an extraordinary point
+        # where a seam ends, as positions and values contract at different rates.
+        self._has_slope: Any = np.ones(len(corner), dtype=bool)
+        corners = np.flatnonzero((uv == 0).all(axis=1))
+        samples = self._sampler(self._surface.cage.positions).evaluate(corner[corners], uv[corners])
+        points = corners[samples.level == AT_EXTRAORDINARY_POINT]
+        self._has_slope[points] = contracts_alike(self.channel, self._surface.patches, corner[points])
+        if self.kernel is not None:
+            types = self.kernel.types
+            self._location = Location(types.indices(corner), *map(types.floats, uv.T))
+            self._has_slope = types.indices(self._has_slope.astype(np.uint32)) != 0
+            dr.eval(self._has_slope)
+            self._mean = self._mean if self._mean is None else SparseMatrix(self._mean, types.float)
 
     def require_scale(self) -> None:
         """Raise ValueError if ``displacement_scale`` is not a finite number, unless it cannot be read."""
@@ -107,7 +135,7 @@ class ShapeDisplacement:
 
     def take_scale(self) -> None:
         """Apply ``displacement_scale``."""
-        if self._is_jit:
+        if dr.is_jit_v(self.scale):
             # Dr.Jit compiles literals into kernels.
             dr.make_opaque(self.scale)
         # A copy, because users assign the parameter in place before it is checked.
@@ -116,7 +144,7 @@ class ShapeDisplacement:
             self.kernel.displacement.scale = self._scale
 
     @property
-    def host_scale(self) -> float:
+    def _host_scale(self) -> float:
         return float(np.array(dr.detach(self._scale)).item())
 
     @property
@@ -144,8 +172,8 @@ class ShapeDisplacement:
 
     def bound(self) -> DisplacementBound:
         """Scaled heights as a function of the location, and their bound, for adaptive tessellation."""
-        channel, scale = self.channel, self.host_scale
-        float_type = type(self.scale) if self._is_jit else dr.scalar.ArrayXf64
+        channel, scale = self.channel, self._host_scale
+        float_type = dr.scalar.ArrayXf64 if self.kernel is None else self.kernel.types.float
 
         def heights_at(start: IntArray, uv: FloatArray) -> FloatArray:
             columns = [mapped(float_type, column) for column in channel.evaluate(start, uv).T]
@@ -154,6 +182,63 @@ class ShapeDisplacement:
             return np.broadcast_to(scale * np.array(heights, dtype=np.float64), len(uv))
 
         return DisplacementBound(heights_at, max(map(abs, self.heights.range(channel))) * abs(scale))
+
+    def displaced(
+        self,
+        positions: FloatBuffer,
+        normals: FloatBuffer,
+        points: FloatBuffer,  # Control points of the surface
+    ) -> tuple[FloatBuffer, FloatBuffer]:
+        """Displace flat positions and normals of the vertices."""
+        kernel: Any = self.kernel
+        if kernel is None:
+            return self._displaced_on_host(np.reshape(positions, (-1, 3)), np.reshape(normals, (-1, 3)), points)
+        n, (value, _, _) = dr.unravel(kernel.types.vector3, normals), kernel.displacement.channel(self._location)
+        steps = dr.ravel(self.heights.height(value) * self._scale * n)
+        positions = positions + (steps if self._mean is None else self._mean(steps, 3))
+        if self._has_normals:
+            displaced_normal = kernel.at(self._location).n
+            exists = self._has_slope & (dr.squared_norm(n) > 0) & (dr.squared_norm(displaced_normal) > 0)
+            normals = dr.ravel(dr.select(exists, displaced_normal, n))
+        return positions, normals
+
+    def _displaced_on_host(
+        self, positions: NDArray, normals: NDArray, points: FloatBuffer
+    ) -> tuple[FloatBuffer, FloatBuffer]:
+        rows_of_channel = self.channel.with_derivatives(self._corner, self._uv)
+        value, du, dv = (_columns(rows) if rows.shape[1] > 1 else _columns(rows)[0] for rows in rows_of_channel)
+        steps = np.array(self.heights.height(value))[:, None] * self._host_scale * normals
+        positions = positions + (steps if self._mean is None else self._mean @ steps).astype(np.float32)
+        if self._has_normals:
+            h, h_u, h_v = (self._host_scale * component for component in self.heights(value, du, dv))
+            # Second derivatives do not exist at extraordinary points.
+            sampler = self._sampler(np.array(points, dtype=np.float64).reshape(-1, 3))
+            samples = sampler.evaluate(self._corner, self._uv, derivatives=2)
+            p, dp_du, dp_dv, *second = (_columns(rows) for rows in np.nan_to_num([*samples[:3], *samples[5:8]]))
+            surface = PatchValues(p, dp_du, dp_dv, _columns(samples.n), tuple(second))
+            n = unit(displaced(surface, (h, h_u, h_v)).normal)
+            displaced_normal = np.stack([np.array(column) for column in n], axis=1)
+            exists = self._has_slope & normals.any(axis=1) & displaced_normal.any(axis=1)
+            normals = np.where(exists[:, None], displaced_normal, normals).astype(np.float32)
+        return positions.ravel(), normals.ravel()
+
+    def _sampler(self, points: FloatArray) -> PatchSampler:
+        return PatchSampler(self._surface.patches, points, self._surface.cage.cut_mesh.vertex)
+
+
+def _mean_over_copies(weld_target: NDArray[np.uint32]) -> sparse.csr_array:
+    """Matrix that replaces the vector of each vertex by the mean over its copies, from the first copy of each."""
+    from scipy import sparse
+
+    count = len(weld_target)
+    first_copy = sparse.csr_array((np.ones(count), weld_target, np.arange(count + 1)), (count, count))
+    copies = (first_copy @ first_copy.T).sorted_indices()
+    return sparse.csr_array(sparse.diags_array(1 / copies.sum(axis=1)) @ copies)
+
+
+def _columns(rows: NDArray) -> list[Float]:
+    """Columns of an array: vector components for `displaced`."""
+    return [mapped(dr.scalar.ArrayXf64, column) for column in rows.T]
 
 
 def _attribute_named(given: str, surface: LimitSurface) -> str:
@@ -172,11 +257,8 @@ def _attribute_named(given: str, surface: LimitSurface) -> str:
     return names[given]
 
 
-# Heights are evaluated for arrays of a kernel, single points, and arrays on the host.
-
-
 class TextureHeights(Heights):
-    """Heights of a texture, with derivatives by the chain rule.
+    """Heights of a texture, with derivatives by the chain rule: for arrays of a kernel, single points, and on the host.
 
     The texture's gradient is Mitsuba's ``eval_1_grad`` if the texture implements it, as bitmaps do. Otherwise, it is
     Dr.Jit's derivative of ``eval_1``, or central differences over `DIFFERENCE` in variants without derivatives. The
@@ -305,101 +387,3 @@ class TextureHeights(Heights):
             for step in (DIFFERENCE, -DIFFERENCE)
         )
         return [(a - b) / (2 * DIFFERENCE) for a, b in zip(ahead, behind, strict=True)]
-
-
-class DisplacedVertices:
-    """Displaces the vertices of a tessellation.
-
-    Copies of a vertex along creases and seams are displaced by the mean of their displacements, so that they stay
-    bitwise equal. Each copy has the normal of its side. In JIT variants, differentiable with respect to control points,
-    the scale, and the texture or control values of the heights.
-    """
-
-    def __init__(
-        self,
-        layout: AttributeLayout,  # Vertices with copies along all seams, whose different displacements are averaged
-        weld_target: NDArray[np.uint32] | None,  # Their `split_weld_targets`
-        surface: LimitSurface,
-        displacement: ShapeDisplacement,
-        types: ArrayTypes | None,  # Types of a JIT variant; None in scalar variants
-        *,
-        has_normals: bool,  # Whether normals are needed
-    ) -> None:
-        self._surface, self._displacement, self._has_normals = surface, displacement, has_normals
-        self._types: Any = types
-        # (n,) int64: corner of an element from which parameters are seen, a half-edge of `PatchTable.elements`; and
-        # (n, 2) float64: parameters. Samples at corners of elements have (0, 0).
-        self._corner, self._uv = corner, uv = layout.locate()
-        self._mean: Any = None if weld_target is None else _mean_over_copies(weld_target)
-        # (n,) bool: whether the slope of heights along the surface exists. It does not exist at an extraordinary point
-        # where a seam ends, as positions and values contract at different rates.
-        self._has_slope: Any = np.ones(len(corner), dtype=bool)
-        corners = np.flatnonzero((uv == 0).all(axis=1))
-        samples = self._sampler(surface.cage.positions).evaluate(corner[corners], uv[corners])
-        points = corners[samples.level == AT_EXTRAORDINARY_POINT]
-        self._has_slope[points] = contracts_alike(displacement.channel, surface.patches, corner[points])
-        if types is not None:
-            u, v = (types.floats(column) for column in uv.T)
-            self._location = Location(types.indices(corner), u, v)
-            self._has_slope = types.indices(self._has_slope.astype(np.uint32)) != 0
-            dr.eval(self._has_slope)
-            self._mean = self._mean if self._mean is None else SparseMatrix(self._mean, types.float)
-
-    def __call__(
-        self,
-        positions: FloatBuffer,
-        normals: FloatBuffer,
-        points: FloatBuffer,  # Control points of the surface
-    ) -> tuple[FloatBuffer, FloatBuffer]:
-        """Displace flat positions and normals."""
-        if self._types is None:
-            return self._on_host(positions, normals, points)
-        # The displaced surface, which has the control points
-        kernel: Any = self._displacement.kernel
-        displacement, n = kernel.displacement, dr.unravel(self._types.vector3, normals)
-        value, _, _ = displacement.channel(self._location)
-        steps = dr.ravel(displacement.heights.height(value) * displacement.scale * n)
-        positions = positions + (steps if self._mean is None else self._mean(steps, 3))
-        if self._has_normals:
-            displaced_normal = kernel.at(self._location).n
-            exists = self._has_slope & (dr.squared_norm(n) > 0) & (dr.squared_norm(displaced_normal) > 0)
-            normals = dr.ravel(dr.select(exists, displaced_normal, n))
-        return positions, normals
-
-    def _on_host(self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer) -> tuple:
-        displacement, (positions, normals) = self._displacement, (np.reshape(x, (-1, 3)) for x in (positions, normals))
-        rows_of_channel = displacement.channel.with_derivatives(self._corner, self._uv)
-        value, du, dv = (_columns(rows) if rows.shape[1] > 1 else _columns(rows)[0] for rows in rows_of_channel)
-        heights, scale = displacement.heights, displacement.host_scale
-        steps = np.array(heights.height(value))[:, None] * scale * normals
-        positions = positions + (steps if self._mean is None else self._mean @ steps).astype(np.float32)
-        if self._has_normals:
-            h, h_u, h_v = (scale * component for component in heights(value, du, dv))
-            # Second derivatives do not exist at extraordinary points.
-            sampler = self._sampler(np.array(points, dtype=np.float64).reshape(-1, 3))
-            samples = sampler.evaluate(self._corner, self._uv, derivatives=2)
-            p, dp_du, dp_dv, *second = (_columns(rows) for rows in np.nan_to_num([*samples[:3], *samples[5:8]]))
-            surface = PatchValues(p, dp_du, dp_dv, _columns(samples.n), tuple(second))
-            n = unit(displaced(surface, (h, h_u, h_v)).normal)
-            displaced_normal = np.stack([np.array(column) for column in n], axis=1)
-            exists = self._has_slope & normals.any(axis=1) & displaced_normal.any(axis=1)
-            normals = np.where(exists[:, None], displaced_normal, normals).astype(np.float32)
-        return positions.ravel(), normals.ravel()
-
-    def _sampler(self, points: FloatArray) -> PatchSampler:
-        return PatchSampler(self._surface.patches, points, self._surface.cage.cut_mesh.vertex)
-
-
-def _mean_over_copies(weld_target: NDArray[np.uint32]) -> sparse.csr_array:
-    """Matrix that replaces the vector of each vertex by the mean over its copies, from the first copy of each."""
-    from scipy import sparse
-
-    count = len(weld_target)
-    first_copy = sparse.csr_array((np.ones(count), weld_target, np.arange(count + 1)), (count, count))
-    copies = (first_copy @ first_copy.T).sorted_indices()
-    return sparse.csr_array(sparse.diags_array(1 / copies.sum(axis=1)) @ copies)
-
-
-def _columns(rows: NDArray) -> list[Float]:
-    """Columns of an array: vector components for `displaced`."""
-    return [mapped(dr.scalar.ArrayXf64, column) for column in rows.T]

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ..kernels.vertex_kernel import VertexKernel
     from ..tessellation.attribute_table import AttributeLayout, AttributeTable
     from ..tessellation.vertex_table import VertexTable
-    from .displacement import DisplacedVertices, ShapeDisplacement
+    from .displacement import ShapeDisplacement
     from .exact_shading import ExactShading
     from .parameters import Parameters
 
@@ -87,18 +87,8 @@ class MeshBuffers:
         # Index of each vertex of the mesh among those of the tessellation, if seams have copies
         copied = self.layout.surface_vertex
         self._copied = copied if copied is None or self._types is None else self._types.indices(copied)
-        self._displaced: DisplacedVertices | None = None
         if displacement is not None:
-            from .displacement import DisplacedVertices
-
-            self._displaced = DisplacedVertices(
-                self.layout,
-                split_weld_targets(table, self.layout),
-                parameters.surface,
-                displacement,
-                self._types,
-                has_normals=shading is None and not parameters.face_normals,
-            )
+            displacement.set_triangles(self.layout, split_weld_targets(table, self.layout))
 
     def evaluated(
         self,
@@ -123,7 +113,7 @@ class MeshBuffers:
         evaluate = partial(self._kernel.evaluated, dr.detach(points))
         vertices: tuple[FloatBuffer, FloatBuffer] = evaluate() if loaded is None else loaded.get(evaluate)
         # Also kept for a displacement, as gradients of heights may be enabled later.
-        self._evaluated = vertices if moves or self._displaced is not None else None
+        self._evaluated = vertices if moves or self._displacement is not None else None
         return self._placed(*self._kernel.attached(points, *vertices), points)
 
     def attached(self, control_points: FloatBuffer) -> dict[str, FloatBuffer]:
@@ -186,8 +176,8 @@ class MeshBuffers:
         """Copy, displace and place vertices, and update exact shading."""
         placement, shading = self._placement, self._shading
         positions, normals = self._split(positions), self._split(normals)
-        if self._displaced is not None:
-            positions, normals = self._displaced(positions, normals, points)
+        if self._displacement is not None:
+            positions, normals = self._displacement.displaced(positions, normals, points)
         if not placement.is_identity:
             positions, normals = placement.placed(positions, normals)
         moved = {"vertex_positions": positions, "vertex_normals": normals}
