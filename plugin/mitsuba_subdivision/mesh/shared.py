@@ -18,13 +18,13 @@ Value = TypeVar("Value")
 class Content:
     """An array as part of a key. Arrays are equal if their values, types and shapes are equal."""
 
-    __slots__ = ("_array", "_hash")
+    __slots__ = ("_hash", "array")
 
     def __init__(
         self,
         array: NDArray | None,  # Must not be changed afterwards
     ) -> None:
-        self._array = array
+        self.array = array
         self._hash = 0 if array is None else hash((array.shape, zlib.crc32(np.ascontiguousarray(array).data)))
 
     def __hash__(self) -> int:
@@ -33,7 +33,7 @@ class Content:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Content) or self._hash != other._hash:
             return False
-        a, b = self._array, other._array
+        a, b = self.array, other.array
         if a is b or a is None or b is None:
             return a is b
         return a.dtype == b.dtype and np.array_equal(a, b)

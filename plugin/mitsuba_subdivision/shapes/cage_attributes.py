@@ -1,10 +1,5 @@
 """Texture coordinates and attributes of the cage as differentiable parameters of the shape.
 
-    parameters.py            reads them from a scene
-    cage_attributes.py       exposes them to `traverse` and fills the mesh's buffers: this module
-    exact_shading.py         evaluates them at hits
-    displacement.py          uses them as heights
-
 The parameter ``cage_NAME`` contains the control values of the attribute NAME, flat. The buffer ``vertex_NAME`` contains
 its values at the vertices of the tessellation: the product of a sparse weight matrix and the control values.
 

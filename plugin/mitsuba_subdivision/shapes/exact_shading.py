@@ -4,29 +4,27 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..device_arrays import upload
 from ..kernels.algebra import AffineMap, added, dot, over
 from ..kernels.array_types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Value, Vector2, Vector3
+from ..kernels.channel_kernel import ChannelKernel
 from ..kernels.line_intersection import ON_LINE, Lines
 from ..kernels.locations import Location, TriangleLocations
 from ..kernels.surface_kernel import SurfaceKernel, SurfacePoints
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import shared
-from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS
 from ..variants import Variant
 from .cage_attributes import WIDTHS, mesh_name, spectral_upsampling
 from .placement import Placement
 
 if TYPE_CHECKING:
-    from ..kernels.channel_kernel import ChannelKernel
     from ..tessellation.vertex_table import VertexTable
     from .interaction_hook import TriangleHit
     from .parameters import Parameters
@@ -40,7 +38,7 @@ _PARAMETERS = int(mi.RayFlags.UV) | int(mi.RayFlags.dPdUV) | _NORMAL_DERIVATIVES
 _KINDS = ("are on the ray", "are along the normal nearby", "are shaded where the triangle lies in the surface")
 _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 
-# Number of fixed-point iterations of `hit_by_texcoords`. Each removes most of the difference between texture
+# Number of fixed-point iterations of `ExactShading.at_texcoords`. Each removes most of the difference between texture
 # coordinates on the surface and on its triangles.
 STEPS = 3
 
@@ -69,22 +67,20 @@ class ExactShading:
         self.to_world: Matrix4 = self.kernel.types.matrix4(1)  # For points relative to the centre
         self._counts: IndexBuffer = dr.zeros(self.kernel.types.index, len(_KINDS))
         # Texture coordinates and attributes that are evaluated at hits, by their names in the cage
-        self.channels: dict[str, ChannelKernel] = {}
-        if surface.attribute_names:
-            from ..kernels.channel_kernel import ChannelKernel
-
-            channels = {name: surface.channel(name) for name in surface.attribute_names}
-            self.channels = {
-                name: ChannelKernel(channel, variant.Float)
-                for name, channel in channels.items()
-                if name == TEXCOORDS or channel.values.shape[1] in WIDTHS
-            }
+        channels = {name: surface.channel(name) for name in surface.attribute_names}
+        self.channels = {
+            name: ChannelKernel(channel, variant.Float)
+            for name, channel in channels.items()
+            if name == TEXCOORDS or channel.values.shape[1] in WIDTHS
+        }
         self._texcoords = self.channels.get(TEXCOORDS)
         self._attributes = {mesh_name(name): channel for name, channel in self.channels.items() if name != TEXCOORDS}
         sizes = {name: channel.values.size for name, channel in self._attributes.items()}
         self._upsampling = spectral_upsampling(variant, sizes)
         self._shape: Callable[[], mi.Mesh | None] = lambda: None
         self._sign = 1.0
+        # The triangles over current texture coordinates; None until they are needed.
+        self.texture_scene: mi.Scene | None = None
 
     def set_triangles(self, table: VertexTable, kept: IntArray | None = None) -> None:
         """Set the triangles of the shape before the first hit: all of a table, or those with the indices ``kept``."""
@@ -209,17 +205,49 @@ class ExactShading:
         value = self._attributes[name](location, active)[0]
         return self._upsampling[name](value) if name in self._upsampling else value
 
-    def texcoords_of_corners(self, face_count: int) -> FloatArray:
-        """Texture coordinates ``(3 n, 2)`` at the corners of all triangles, in their order in the mesh."""
-        if self._texcoords is None:
-            raise RuntimeError(f"{self._name} has no texture coordinates")
+    def at_texcoords(self, uv: Vector2, ray_flags: int, active: Mask) -> mi.SurfaceInteraction3f:
+        """Interaction at the point of the shape with given texture coordinates; invalid where there is none."""
+        variant, shape = self._variant, cast("mi.Mesh", self._shape())
+        if self.texture_scene is None:
+            self.texture_scene = self._over_texcoords(shape.face_count())
+        scene = self.texture_scene
+
+        def at(uv: Vector2, active: Mask) -> mi.SurfaceInteraction3f:
+            uv_ray = variant.Ray3f(variant.Point3f(uv.x, uv.y, -1), variant.Vector3f(0, 0, 1))
+            preliminary = scene.ray_intersect_preliminary(uv_ray, active=active)
+            active &= preliminary.is_valid()
+            index = dr.select(active, preliminary.prim_index, 0)
+            corners = [shape.vertex_position(vertex, active) for vertex in shape.face_indices(index, active)]
+            n, (b1, b2) = shape.face_normal(index, active), preliminary.prim_uv
+            point = corners[0] + (corners[1] - corners[0]) * b1 + (corners[2] - corners[0]) * b2
+            ray = variant.Ray3f(dr.detach(point + n), dr.detach(variant.Vector3f(-n)))
+            preliminary.t = dr.select(active, variant.Float(1), dr.inf)
+            preliminary.shape = variant.ShapePtr(shape)
+            return preliminary.compute_surface_interaction(ray, ray_flags | int(mi.RayFlags.UV), active)
+
+        target: Any = uv
+        si = at(uv, active)
+        for _ in range(STEPS):
+            target = target + dr.select(si.is_valid(), uv - si.uv, 0)
+            next_si = at(target, active & si.is_valid())
+            si = dr.select(next_si.is_valid(), next_si, si)
+        return si
+
+    def _over_texcoords(self, face_count: int) -> mi.Scene:
+        """Scene of the shape's triangles over the plane of texture coordinates."""
         index, b1, b2 = np.repeat(np.arange(face_count), 3), *np.tile(np.eye(3)[1:], face_count)
         if self._are_turned:
             b1, b2 = b2, b1
-        types = self.kernel.types
+        types, texcoords = self.kernel.types, self.channels[TEXCOORDS]
+        mesh = self._variant.Mesh("texture coordinates", 3 * face_count, face_count)
         with dr.suspend_grad():
             location = self._located(types.indices(index), types.floats(b1), types.floats(b2), True)
-            return np.array(self._texcoords(location, True)[0]).T
+            u, v = texcoords(location, True)[0]
+        parameters = mi.traverse(mesh)
+        parameters["vertex_positions"] = dr.ravel(types.vector3(u, v, 0))
+        parameters["faces"] = dr.arange(types.index, 3 * face_count)
+        parameters.update()
+        return mi.load_dict({"type": "scene", "mesh": mesh})
 
     def _is_moving(self) -> bool:
         """Whether control points, transformation or displacement are differentiated."""
@@ -292,46 +320,3 @@ def _facing(n: Vector3, d: Vector3, facing: Float) -> Vector3:
     target_cosine = dr.select(facing < 0, -GRAZING, GRAZING)
     turned = added(detached, d, (target_cosine - cosine) * inverse)
     return dr.select(cosine * facing < 0, turned * dr.rsqrt(dot(turned, turned)), n)
-
-
-def texture_scene(variant: Variant, shape: mi.Mesh, exact: ExactShading) -> mi.Scene:
-    """Scene of a shape's triangles over the plane of texture coordinates, in which `hit_by_texcoords` finds them."""
-    uv = exact.texcoords_of_corners(shape.face_count())
-    mesh = variant.Mesh("texture coordinates", vertex_count=len(uv), face_count=len(uv) // 3)
-    parameters = mi.traverse(mesh)
-    for name, values in (("vertex_positions", np.pad(uv, ((0, 0), (0, 1)))), ("faces", np.arange(len(uv)))):
-        parameters[name] = upload(type(parameters[name]), values)
-    parameters.update()
-    return mi.load_dict({"type": "scene", "mesh": mesh})
-
-
-def hit_by_texcoords(
-    variant: Variant,
-    scene: mi.Scene,  # Made by `texture_scene`, of current texture coordinates
-    shape: mi.Mesh,
-    uv: Vector2,
-    ray_flags: int,
-    active: Mask,
-) -> mi.SurfaceInteraction3f:
-    """Interaction at the point of a shape with given texture coordinates; invalid where there is none."""
-
-    def at(uv: Vector2, active: Mask) -> mi.SurfaceInteraction3f:
-        uv_ray = variant.Ray3f(variant.Point3f(uv.x, uv.y, -1), variant.Vector3f(0, 0, 1))
-        preliminary = scene.ray_intersect_preliminary(uv_ray, active=active)
-        active &= preliminary.is_valid()
-        index = dr.select(active, preliminary.prim_index, 0)
-        corners = [shape.vertex_position(vertex, active) for vertex in shape.face_indices(index, active)]
-        n, (b1, b2) = shape.face_normal(index, active), preliminary.prim_uv
-        point = corners[0] + (corners[1] - corners[0]) * b1 + (corners[2] - corners[0]) * b2
-        ray = variant.Ray3f(dr.detach(point + n), dr.detach(variant.Vector3f(-n)))
-        preliminary.t = dr.select(active, variant.Float(1), dr.inf)
-        preliminary.shape = variant.ShapePtr(shape)
-        return preliminary.compute_surface_interaction(ray, ray_flags | int(mi.RayFlags.UV), active)
-
-    target: Any = uv
-    si = at(uv, active)
-    for _ in range(STEPS):
-        target = target + dr.select(si.is_valid(), uv - si.uv, 0)
-        next_si = at(target, active & si.is_valid())
-        si = dr.select(next_si.is_valid(), next_si, si)
-    return si

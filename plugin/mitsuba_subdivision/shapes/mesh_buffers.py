@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 from weakref import WeakMethod
@@ -15,7 +14,7 @@ from ..device_arrays import mapped
 from ..kernels.array_types import ArrayTypes, FloatBuffer, IndexBuffer, LaterArrays, Matrix4
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared, SharedArray, shared
-from ..surface import TEXCOORDS, LimitSurface
+from ..surface import LimitSurface
 from ..variants import Variant
 from .derivatives import computed_ones, warn_of_lost, watched
 from .placement import Placement
@@ -23,14 +22,12 @@ from .placement import Placement
 if TYPE_CHECKING:
     from ..kernels.surface_kernel import SurfaceKernel
     from ..kernels.vertex_kernel import VertexKernel
-    from ..tessellation.attribute_table import AttributeLayout, AttributeTable
+    from ..tessellation.attribute_table import AttributeLayout
     from ..tessellation.vertex_table import VertexTable
     from .displacement import ShapeDisplacement
     from .exact_shading import ExactShading
     from .parameters import Parameters
 
-# Arrays, shared by shapes with the same tessellation.
-_SHARED: Shared[SharedArray] = Shared()
 # Vertices of loaded control points in object space, shared by shapes of equal cages, and their largest number: few take
 # longer to trace than to compute, and more take memory.
 _LOADED: Shared[LaterArrays] = Shared()
@@ -51,9 +48,6 @@ class MeshBuffers:
     def __init__(
         self,
         variant: Variant,
-        table: VertexTable,
-        attributes: AttributeTable,  # Vertices of the mesh, with or without copies along seams
-        kept: IntArray | None,  # (n,) int64: indices of the triangles of the mesh; None for all
         parameters: Parameters,
         placement: Placement,
         shading: ExactShading | None,
@@ -61,34 +55,41 @@ class MeshBuffers:
         # Method that is called with the gradients of the moving arrays, by name, after each reverse-mode pass
         on_backward: WeakMethod,
     ) -> None:
-        self._variant, self._kept = variant, kept
-        self.table, self.layout, self._parameters = table, attributes.layout, parameters
-        self._placement, self._shading, self._displacement = placement, shading, displacement
-        self._on_backward = on_backward
-        self.has_texcoords = TEXCOORDS in attributes.values
-        # References that keep shared arrays alive.
-        self._held: dict[str, SharedArray | LaterArrays] = {}
-        is_jit = dr.is_jit_v(variant.Float)
-        self._types = ArrayTypes(variant.Float) if is_jit else None
+        self._variant, self._parameters, self._placement = variant, parameters, placement
+        self._shading, self._displacement, self._on_backward = shading, displacement, on_backward
+        # The surface of hits and of displaced normals; None if it is not needed.
+        evaluates = shading or displacement
+        self._surface: SurfaceKernel | None = None if evaluates is None else evaluates.kernel
+        self._types = ArrayTypes(variant.Float) if dr.is_jit_v(variant.Float) else None
         self._is_sampled = parameters.evaluator != "stabilized" or parameters.sample_offset > 0
-        self._kernel: VertexKernel | None = None
-        if is_jit and not self._is_sampled:
-            from ..kernels.vertex_kernel import VertexKernel
-
-            self._kernel = shared(VertexKernel, table, variant.Float)
         # Whether vertices are differentiable with respect to control points, placement and displacement.
-        self.are_differentiable = self._kernel is not None and dr.is_diff_v(variant.Float)
+        self.are_differentiable = not self._is_sampled and dr.is_diff_v(variant.Float)
         self._computed: set[int] = set()
         self._evaluated: tuple[FloatBuffer, FloatBuffer] | None = None
-        # None if vertices are not shared, and after the first evaluation.
+
+    def set_triangles(
+        self,
+        table: VertexTable,
+        layout: AttributeLayout,  # Vertices of the mesh, with or without copies along seams
+        kept: IntArray | None,  # (n,) int64: indices of the triangles of the mesh; None for all
+    ) -> None:
+        """Set the triangles, and the vertices to evaluate."""
+        self.table, self.layout, self._kept = table, layout, Content(kept)
+        self._kernel: VertexKernel | None = None
+        if self._types is not None and not self._is_sampled:
+            from ..kernels.vertex_kernel import VertexKernel
+
+            self._kernel = shared(VertexKernel, table, self._types.float)
+        # Used by the first evaluation alone, and kept alive for those of other shapes; None if vertices are not shared.
         self._loaded: LaterArrays | None = None
         if self._kernel is not None and table.vertex_count <= MOST_SHARED:
-            self._loaded = self._held["loaded"] = _LOADED.get((self._kernel, parameters.surface.cage), LaterArrays)
+            self._loaded = _LOADED.get((self._kernel, self._parameters.surface.cage), LaterArrays)
+        self._is_loaded = True
         # Index of each vertex of the mesh among those of the tessellation, if seams have copies
-        copied = self.layout.surface_vertex
+        copied = layout.surface_vertex
         self._copied = copied if copied is None or self._types is None else self._types.indices(copied)
-        if displacement is not None:
-            displacement.set_triangles(self.layout, split_weld_targets(table, self.layout))
+        if self._displacement is not None:
+            self._displacement.set_triangles(layout, split_weld_targets(table, layout))
 
     def evaluated(
         self,
@@ -98,7 +99,7 @@ class MeshBuffers:
     ) -> dict[str, FloatBuffer]:
         """Evaluate the mesh's buffers, and update exact shading. Returns the buffers by name."""
         points, surface = self._placement.relative(control_points), self._surface
-        loaded, self._loaded = None if moves_points else self._loaded, None
+        loaded, self._is_loaded = self._loaded if self._is_loaded and not moves_points else None, False
         if surface is not None and moves_points:
             surface.set_control_points(points)
         elif surface is not None and self.are_differentiable and dr.grad_enabled(points):
@@ -134,13 +135,6 @@ class MeshBuffers:
         names = "control_points or to_world" if self._displacement is None else "control_points, to_world or heights"
         sources = self._sources(control_points)
         warn_of_lost(self._parameters.source, names, sources, self._computed, gradients.values())
-
-    @property
-    def _surface(self) -> SurfaceKernel | None:
-        """The surface of hits and of displaced normals; None if it is not needed."""
-        if self._shading is not None:
-            return self._shading.kernel
-        return None if self._displacement is None else self._displacement.kernel
 
     def _sources(self, control_points: FloatBuffer) -> list:
         """Arrays that vertices depend on."""
@@ -193,39 +187,42 @@ class MeshBuffers:
 
     def faces(self, *, are_turned: bool) -> IndexBuffer:
         """Vertices of all triangles, flat; in reversed order if ``are_turned``."""
-
-        def make() -> NDArray:
-            triangles = self._of_kept(self.layout.triangles)
-            return triangles[:, [0, 2, 1]] if are_turned else triangles
-
-        return self._shared("faces", (self.layout, are_turned, Content(self._kept)), make, self._variant.UInt32)
+        self._faces = shared(_faces, self._variant.UInt32, self.layout, self._kept, are_turned)
+        return self._faces.array
 
     @property
     def element(self) -> FloatBuffer:
         """Element of each triangle; a buffer of floats."""
-        key = self.table, Content(self._kept)
-        return self._shared("element", key, lambda: self._of_kept(self.table.element), self._variant.Float)
+        self._element = shared(_elements, self._variant.Float, self.table, self._kept)
+        return self._element.array
 
     @property
     def weld_target(self) -> IndexBuffer | None:
         """See `split_weld_targets`; None if no vertex has copies."""
-        targets = partial(split_weld_targets, self.table, self.layout)
-        return self._shared("weld_target", (self.table, self.layout), targets, self._variant.UInt32)
+        self._weld_target = shared(_weld_targets, self._variant.UInt32, self.table, self.layout)
+        return self._weld_target.array
 
-    def _of_kept(self, of_triangles: NDArray) -> NDArray:
-        return of_triangles if self._kept is None else of_triangles[self._kept]
 
-    def _shared(
-        self, name: str, key: tuple, make: Callable[[], NDArray | None], kind: type
-    ) -> FloatBuffer | IndexBuffer:
-        def array() -> SharedArray:
-            values = make()
-            if values is None:
-                return SharedArray(None)
-            return SharedArray(mapped(kind, values) if dr.is_jit_v(kind) else values.ravel())
+# Arrays, shared by shapes with the same tessellation.
 
-        shared = self._held[name] = _SHARED.get((name, self._variant, *key), array)
-        return shared.array
+
+def _faces(kind: type, layout: AttributeLayout, kept: Content, are_turned: bool) -> SharedArray:
+    triangles = layout.triangles if kept.array is None else layout.triangles[kept.array]
+    return _array(kind, triangles[:, [0, 2, 1]] if are_turned else triangles)
+
+
+def _elements(kind: type, table: VertexTable, kept: Content) -> SharedArray:
+    return _array(kind, table.element if kept.array is None else table.element[kept.array])
+
+
+def _weld_targets(kind: type, table: VertexTable, layout: AttributeLayout) -> SharedArray:
+    return _array(kind, split_weld_targets(table, layout))
+
+
+def _array(kind: type, values: NDArray | None) -> SharedArray:
+    if values is None:
+        return SharedArray(None)
+    return SharedArray(mapped(kind, values) if dr.is_jit_v(kind) else values.ravel())
 
 
 def split_weld_targets(table: VertexTable, layout: AttributeLayout) -> NDArray[np.uint32] | None:

@@ -19,11 +19,11 @@ from ..tessellation import HIGHEST_RATE
 if TYPE_CHECKING:
     import mitsuba as mi
 
-# Parameters of a scene: name, type, default and flag, and a description with literals between double backticks. The
-# type is one of Mitsuba's documentation, several are joined by " or ". A name may contain ``NAME``, a placeholder for
-# an attribute's name. A default that is no single value is described. Other values that a string may have follow its
-# default; the cage checks its rules, which may also come from a file. A parameter without a flag is read when the shape
-# is loaded only.
+# Parameters of a scene: name, type, default and flags, and a description with literals between double backticks. Types
+# and flags are those of Mitsuba's documentation; several types are joined by " or ". A name may contain ``NAME``, a
+# placeholder for an attribute's name. A default that is no single value is described. Other values that a string may
+# have follow its default; the cage checks its rules, which may also come from a file. A parameter without a flag is
+# read when the shape is loaded only.
 _PARAMETERS = f"""
 filename : string
     Control cage: an OBJ, PLY or USD file. Polygons are not triangulated. Creases, corners, holes and subdivision rules
@@ -127,15 +127,15 @@ shading : string = vertex | exact | auto
 displacement : texture or string
     Heights that displace the surface along its normals: a scalar texture over the texture coordinates, or the mesh
     attribute ``vertex_NAME`` of a cage's attribute with one number per value. (Default: none)
-displacement_scale : float; discontinuous
-    Factor of the heights. (Default: 1)
+displacement_scale : float = 1; exposed, differentiable, discontinuous
+    Factor of the heights.
 evaluator : string = stabilized | stam
     ``stabilized``, or ``stam``: points and normals by Stam's form in single precision, which fails at extraordinary
     vertices; for comparison.
 sample_offset : float = 0
     Sample extraordinary vertices at u = v = this value instead of at the vertex itself, where Stam's form has no value;
     below 1.
-to_world : transform; discontinuous
+to_world : transform; exposed, differentiable, discontinuous
     Linear object-to-world transformation. Reflections keep the outside of the surface. (Default: none, i.e. object
     space = world space)
 flip_normals : bool = false
@@ -148,39 +148,31 @@ silhouette_sampling_weight : float = 1; exposed
 
 # Parameters that only `traverse` exposes.
 _STATE = """
-control_points : float[]; discontinuous
+control_points : float[]; exposed, differentiable, discontinuous
     Vertices of the control cage, flat x, y, z, in object space.
-cage_texcoords : float[]; discontinuous
+cage_texcoords : float[]; exposed, differentiable, discontinuous
     Texture coordinates of the control cage, flat. Updates move those of the tessellation, and a surface that a texture
     displaces.
-cage_NAME : float[]; differentiable
+cage_NAME : float[]; exposed, differentiable
     Values of an attribute of the control cage, flat, in the order in which they were given; discontinuous if they
     displace the surface.
-patch_count : int; readonly
+patch_count : int; exposed, readonly
     Number of patches of the surface.
-vertex_positions : float[]; discontinuous
+vertex_positions : float[]; exposed, differentiable, discontinuous
     Points of the tessellation in world space. Updates of the control points overwrite assigned values.
-vertex_normals : float[]; discontinuous
+vertex_normals : float[]; exposed, differentiable, discontinuous
     Normals of the tessellation, likewise; none with ``face_normals`` or exact shading.
-vertex_texcoords : float[]; differentiable
+vertex_texcoords : float[]; exposed, differentiable
     Texture coordinates of the tessellation; none with exact shading. Updates of ``cage_texcoords`` overwrite assigned
     values.
-vertex_NAME : float[]; differentiable
+vertex_NAME : float[]; exposed, differentiable
     Mesh attribute: an attribute's values at the tessellation's vertices. Updates of ``cage_NAME`` overwrite them.
-face_element : float[]; differentiable
+face_element : float[]; exposed, differentiable
     Mesh attribute: 0-based face of the control cage (vertex for Doo-Sabin) that each triangle belongs to.
 faces : int[]; exposed
     Vertices of the tessellation's triangles.
 """
 
-# Flags of parameters that `traverse` exposes, as Mitsuba's documentation names them, by the flags in the table.
-_FLAGS: dict[str, tuple[str, ...]] = {
-    "": (),
-    "exposed": ("exposed",),
-    "readonly": ("exposed", "readonly"),
-    "differentiable": ("exposed", "differentiable"),
-    "discontinuous": ("exposed", "differentiable", "discontinuous"),
-}
 # Python types of Mitsuba's checked types, their names in messages, and how a default is read from the table.
 _TYPES: dict[str, tuple[type | tuple[type, ...], str, Callable[[str], Any]]] = {
     "string": (str, "a string", str),
@@ -189,18 +181,14 @@ _TYPES: dict[str, tuple[type | tuple[type, ...], str, Callable[[str], Any]]] = {
     "bool": (bool, "true or false", lambda text: text == "true"),
 }
 # Predicates for numbers of the right type, and descriptions of the numbers that they accept.
-_RATE = (lambda rate: 1 <= rate <= HIGHEST_RATE, f"1 to {HIGHEST_RATE} segments per edge")
-_LIMIT = (lambda limit: 0 < limit < inf, "a number above 0")
-_FILM_SIZE = (lambda size: size >= 1, "1 or more pixels")
 _NUMBERS: dict[str, tuple[Callable[[Any], bool], str]] = {
-    "tessellation_rate": _RATE,
-    "max_rate": _RATE,
-    "chord_error": _LIMIT,
-    "pixel_error": _LIMIT,
-    "max_edge": _LIMIT,
+    **dict.fromkeys(
+        ("tessellation_rate", "max_rate"),
+        (lambda rate: 1 <= rate <= HIGHEST_RATE, f"1 to {HIGHEST_RATE} segments per edge"),
+    ),
+    **dict.fromkeys(("chord_error", "pixel_error", "max_edge"), (lambda limit: 0 < limit < inf, "a number above 0")),
+    **dict.fromkeys(("film_width", "film_height"), (lambda size: size >= 1, "1 or more pixels")),
     "sensor_fov": (lambda fov: 0 <= fov < 180, "0, for an orthographic sensor, or degrees below 180"),
-    "film_width": _FILM_SIZE,
-    "film_height": _FILM_SIZE,
     "displacement_scale": (lambda scale: -inf < scale < inf, "a finite number"),
     "sample_offset": (lambda offset: 0 <= offset < 1, "at least 0 and below 1"),
 }
@@ -294,7 +282,7 @@ class Parameter:
 def _parameter(entry: str) -> Parameter:
     """Read an entry of a table."""
     head, *lines = entry.splitlines()
-    head, _, flag = head.partition("; ")
+    head, _, flags = head.partition("; ")
     head, *values = re.split(r" = | \| ", head)
     stated = values[0] if values else ""
     name, kind = head.split(" : ")
@@ -307,7 +295,7 @@ def _parameter(entry: str) -> Parameter:
         description.removesuffix("."),
         _TYPES[kind][2](stated) if stated else None,
         default_text.removesuffix(")"),
-        _FLAGS[flag],
+        tuple(flags.split(", ")) if flags else (),
         tuple(values) if len(values) > 1 else (),
         *_NUMBERS.get(name, (None, "")),
     )

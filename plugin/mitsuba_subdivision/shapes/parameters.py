@@ -210,16 +210,11 @@ def _tessellation(props: mi.Properties) -> Tessellation:
     from ..tessellation.criterion import Criterion, Measure
 
     (limit,) = limits
-    error, fits_outline, is_of_pixels = (
-        value_of(props, limit),
-        value_of(props, "outline") == "sensor",
-        limit == "pixel_error",
-    )
-    needed_by = "outline" if fits_outline else "pixel_error" if is_of_pixels else None
-    sensor = _sensor(props, needed_by)
+    is_of_pixels, fits_outline = limit == "pixel_error", value_of(props, "outline") == "sensor"
+    sensor = _sensor(props, "outline" if fits_outline else "pixel_error" if is_of_pixels else None)
     criterion = Criterion(
         Measure.EDGE if limit == "max_edge" else Measure.CHORD,
-        float(error),
+        float(value_of(props, limit)),
         sensor if is_of_pixels else None,
         sensor if fits_outline else None,
     )
@@ -266,11 +261,11 @@ def sensor_in_world(
 
 def _displacement(props: mi.Properties) -> tuple[Any, float]:
     """Heights, as a texture, a name of a mesh attribute or None, and their scale."""
-    scale = value_of(props, "displacement_scale")
+    scale = float(value_of(props, "displacement_scale"))
     if "displacement" not in props:
-        if scale is not None:
+        if "displacement_scale" in props:
             raise ValueError('parameter "displacement_scale" needs "displacement"')
-        return None, 1.0
+        return None, scale
     heights = props["displacement"]
     if not isinstance(heights, str) and not hasattr(heights, "eval_1_grad"):
         description = heights.class_name() if hasattr(heights, "class_name") else repr(heights)
@@ -278,7 +273,7 @@ def _displacement(props: mi.Properties) -> tuple[Any, float]:
             f'parameter "displacement" is {description}; expected a texture, or the name of an attribute, such as '
             '"vertex_height"'
         )
-    return heights, 1.0 if scale is None else float(scale)
+    return heights, scale
 
 
 def _reject_unknown(props: mi.Properties) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from weakref import WeakMethod
 
 import drjit as dr
@@ -67,8 +67,6 @@ def make_subdivision(
             self._has_textured_emitter = _has_textured_emitter(props, variant)
             self._placement = Placement(surface.cage.positions, kind, recentres=parameters.evaluator == "stabilized")
             self._exact: ExactShading | None = None
-            # The triangles over texture coordinates; None until they are needed.
-            self._texture_scene: Any = None
             self._has_texcoords = TEXCOORDS in surface.attribute_names
             if is_exact:
                 from .exact_shading import ExactShading
@@ -96,6 +94,9 @@ def make_subdivision(
             # From a list: with a NumPy array, the compiled kernel would depend on the alignment of its memory.
             self.to_world = variant.AffineTransform4f(parameters.to_world.tolist())
             self._placement.take(self.to_world, parameters.to_world)
+            drawn = self._exact, self._displacement
+            on_moved = WeakMethod(self.renew_derivatives)
+            self._mesh = MeshBuffers(variant, parameters, self._placement, *drawn, on_moved)
             self._prepare(surface.cage.positions, parameters.to_world)
 
             super().__init__(
@@ -104,7 +105,7 @@ def make_subdivision(
                 face_count=0,
                 props=props,
                 has_vertex_normals=not (parameters.face_normals or is_exact),
-                has_vertex_texcoords=self._mesh.has_texcoords,
+                has_vertex_texcoords=self._has_texcoords and (not is_exact or self._has_textured_emitter),
             )
             if self._exact is not None:
                 from .interaction_hook import interaction_hook
@@ -135,19 +136,8 @@ def make_subdivision(
             if self._exact is not None:
                 self._exact.set_triangles(table, kept)
             self._cage.set_triangles(attributes)
-            self._mesh = MeshBuffers(
-                variant,
-                table,
-                attributes,
-                kept,
-                parameters,
-                self._placement,
-                self._exact,
-                self._displacement,
-                WeakMethod(self.renew_derivatives),
-            )
+            self._mesh.set_triangles(table, attributes.layout, kept)
             self._has_outlines = False
-            self._texture_scene = None
 
         def _assemble(self, *, moves_points: bool) -> None:
             """Fill all buffers of the mesh."""
@@ -193,7 +183,8 @@ def make_subdivision(
             # Check parameters before anything changes.
             to_world, tessellation = self._checked(keys)
             attributes = self._cage.update(keys)
-            self._texture_scene = None
+            if self._exact is not None:
+                self._exact.texture_scene = None
             if "faces" in keys:
                 # Mitsuba discards the silhouette edges of old faces.
                 self._has_outlines = False
@@ -304,17 +295,9 @@ def make_subdivision(
             if self._exact is not None or self.has_face_normals():
                 values.pop("vertex_normals", None)
             for name, member, cpp_type in traversed(variant, super().traverse):
-                if name not in values:
-                    continue
-                if is_jit:
-                    variant.set_property(member, cpp_type, values[name])
-                    continue
-                # `set_property` would copy twice: to an array of Mitsuba's type, and from there to the mesh.
-                buffer = variant.get_property(member, cpp_type, self)
-                if len(buffer) != len(values[name]):
-                    variant.set_property(member, cpp_type, dr.empty(type(buffer), len(values[name])))
-                    buffer = variant.get_property(member, cpp_type, self)
-                np.array(buffer, copy=False)[:] = values[name]
+                if name in values:
+                    kind = type(variant.get_property(member, cpp_type, self))
+                    variant.set_property(member, cpp_type, values[name] if is_jit else kind(values[name]))
             self._evaluated |= {name: value.index for name, value in values.items() if dr.is_jit_v(value)}
             self._lengths |= {name: len(value) for name, value in values.items()}
 
@@ -375,16 +358,10 @@ def make_subdivision(
 
             Raises RuntimeError if the cage has no texture coordinates.
             """
-            if self.has_vertex_texcoords():
-                return super().eval_parameterization(uv, ray_flags, active)
             self._require_at_vertices("eval_parameterization", "texture coordinates", self._has_texcoords)
-            from .exact_shading import hit_by_texcoords, texture_scene
-
-            if self._texture_scene is None and self._exact is not None:
-                self._texture_scene = texture_scene(variant, self, self._exact)
-            return hit_by_texcoords(
-                variant, self._texture_scene, self, variant.Point2f(uv), int(ray_flags), variant.Mask(active)
-            )
+            if self._exact is None or self.has_vertex_texcoords():
+                return super().eval_parameterization(uv, ray_flags, active)
+            return self._exact.at_texcoords(variant.Point2f(uv), int(ray_flags), variant.Mask(active))
 
         def recompute_vertex_normals(self) -> None:
             """Replace the normals of the limit surface by averages of triangle normals.
@@ -413,12 +390,8 @@ def make_subdivision(
 
         def to_string(self) -> str:
             box = self.bbox()
-            children = {
-                "bsdf": self.bsdf(),
-                "emitter": self.emitter(),
-                "interior_medium": self.interior_medium(),
-                "exterior_medium": self.exterior_medium(),
-            }
+            names = "bsdf", "emitter", "interior_medium", "exterior_medium"
+            children = {name: getattr(self, name)() for name in names}
             lines = [
                 f'source = "{self._parameters.source}"',
                 f'scheme = "{self._parameters.surface.scheme.name}"',
