@@ -20,8 +20,7 @@ BY_NAME = {"__init__.py", "commands/__init__.py", "files/formats.py", "figures/_
 # Packages that may import a library that the numpy packages do without.
 MAY_IMPORT = {
     "mitsuba": {"variants", "mitsuba_mesh", "shapes", "fit", "regression", "figures", "studio", "doctor", "commands"},
-    "drjit": {"llvm", "variants", "device_arrays", "kernels", "shapes", "fit", "regression", "figures"}
-    | {"doctor", "commands"},
+    "drjit": {"llvm", "variants", "device_arrays", "kernels", "shapes", "fit", "regression", "figures", "commands"},
     "matplotlib": {"regression", "figures"},
     "plyfile": {"files"},
     "pxr": {"files"},

@@ -12,7 +12,8 @@ import sys
 import time
 from typing import Any
 
-from .llvm import lowest_version, select_llvm, version_without_package
+from .llvm import loaded_version, lowest_version, select_llvm, version_without_package
+from .variants import variant_problem
 
 # Variants that are tried, and whether a machine is expected to have what they need.
 VARIANTS = {"scalar_rgb": True, "llvm_ad_rgb": True, "cuda_ad_rgb": False}
@@ -28,7 +29,7 @@ CUBE_HEIGHT = 68 / 81
 # Half the side of the pixel, so small that the height is the same all over it.
 _PIXEL = 1e-6
 TOLERANCE = 1e-5
-_CHILD = "import sys; from mitsuba_subdivision.doctor import _print_report; _print_report(sys.argv[1])"
+_CHILD = "import json, sys; from mitsuba_subdivision import doctor; print(json.dumps(doctor._report(sys.argv[1])))"
 
 
 def diagnose(
@@ -120,24 +121,13 @@ def _in_process(variant: str, seconds: float) -> dict[str, Any]:
         return {"works": False, "problem": f"the process ended with {done.returncode}: {last}"}
 
 
-def _print_report(variant: str) -> None:
-    """Try a variant in this process, and print the report as JSON."""
-    print(json.dumps(_report(variant)), flush=True)  # noqa: T201 - for the process that has started this one
-
-
 def _report(variant: str) -> dict[str, Any]:
-    import drjit as dr
+    """What `try_variant` returns, from a trial in this process."""
     import mitsuba as mi
 
-    from .llvm import llvm_problem, loaded_version
-
     report = {"works": None, "llvm": loaded_version()}
-    if variant not in mi.variants():
-        return {**report, "problem": f"Mitsuba {mi.__version__} was compiled without it"}
-    if variant.startswith("llvm") and (problem := llvm_problem()):
+    if problem := variant_problem(variant):
         return {**report, "problem": problem}
-    if variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
-        return {**report, "problem": "Dr.Jit finds no CUDA device or driver"}
     mi.set_variant(variant)
     if problem := _problem(shading="vertex", tessellation_rate=2):
         return {**report, "works": False, "problem": problem}

@@ -16,9 +16,8 @@ from .files.ply import write_polygons
 from .mesh.connectivity import IntArray
 from .variants import SceneNode
 
-_COLUMNS = {"vertex_positions": "xyz", "vertex_normals": ("nx", "ny", "nz"), "vertex_texcoords": "uv"}
-# Buffers that a mesh has without adding them as attributes.
-OWN_BUFFERS = ("vertex_positions", "vertex_normals", "vertex_texcoords")
+# Buffers that a mesh has without adding them as attributes, and their columns in a PLY file.
+_BUFFERS = {"vertex_positions": "xyz", "vertex_normals": ("nx", "ny", "nz"), "vertex_texcoords": "uv"}
 
 
 def mitsuba_mesh(
@@ -48,12 +47,12 @@ def mitsuba_mesh(
         has_vertex_texcoords="vertex_texcoords" in buffers,
     )
     for key, values in buffers.items():
-        if key not in OWN_BUFFERS:
+        if key not in _BUFFERS:
             mesh.add_attribute(key, values.shape[1], [0.0] * values.size)
     parameters = mi.traverse(mesh)
     for key, values in {"faces": triangles, **buffers}.items():
         stored = values
-        if mi.is_spectral and key not in OWN_BUFFERS and values.shape[1] == 3 and "color" in key.lower():
+        if mi.is_spectral and key not in _BUFFERS and values.shape[1] == 3 and "color" in key.lower():
             # Of colours, Mitsuba's meshes store spectra.
             colors, row = np.unique(values, axis=0, return_inverse=True)
             stored = np.array([mi.srgb_model_fetch(color) for color in colors.tolist()])[row.ravel()]
@@ -90,7 +89,7 @@ class PolygonMesh:
         columns: dict[str, NDArray] = {}
         for name, values in self.vertices.items():
             stem = name.removeprefix("vertex_")
-            columns.update(zip(_COLUMNS.get(name, [f"{stem}_{letter}" for letter in "xyz"]), values.T, strict=False))
+            columns.update(zip(_BUFFERS.get(name, [f"{stem}_{letter}" for letter in "xyz"]), values.T, strict=False))
         properties = {name: values.astype(np.float32) for name, values in columns.items()}
         write_polygons(path, properties, np.full(len(self.triangles), 3), self.triangles.ravel())
 

@@ -91,23 +91,14 @@ class CageSource:
     """Origin of a control cage, which names the cage, its vertices and its faces in messages.
 
     All methods take 0-based indices.
-
-    Parameters
-    ----------
-    name : str
-        Name of the whole cage; for a file, its quoted path.
-    index_base : int
-        Number of the first vertex and face in messages: 0 for arrays, 1 for OBJ files.
-    vertex_lines, face_lines : (n_v,), (n_f,) int or None
-        1-based line of each vertex and face in the file; None if the file has no lines.
-    tag_lines : dict of str to sequence of int
-        1-based lines of "creases", "corners" and "holes", if the file has lines.
     """
 
-    name: str = "control cage"
-    index_base: int = 0
+    name: str = "control cage"  # Of the whole cage; for a file, its quoted path
+    index_base: int = 0  # Number of the first vertex and face in messages: 0 for arrays, 1 for OBJ files
+    # (n_v,), (n_f,) int: 1-based line of each vertex and face in the file; None if the file has no lines
     vertex_lines: IntArray | None = None
     face_lines: IntArray | None = None
+    # 1-based lines of "creases", "corners" and "holes", if the file has lines
     tag_lines: Mapping[str, Sequence[int]] = field(default_factory=dict)
 
     def at_face(self, face: int) -> str:

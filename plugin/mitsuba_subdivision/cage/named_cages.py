@@ -29,15 +29,9 @@ def extraordinary(valence: int, *, closed: bool = True) -> ControlCage:
     its mirror image, and a band connects them. The two poles have the given valence, the ``2 * valence`` corners of the
     prism valence 3, and all other vertices valence 4.
 
-    Returns ControlCage: vertex 0 is the pole at (0, 0, 1). Faces 0 to ``valence - 1`` are its one-ring,
-    counter-clockwise, and each begins at vertex 0. Raises CageError if ``valence < 3``.
-
-    Parameters
-    ----------
-    valence : int
-        3 or more.
-    closed : bool
-        False returns a dome with boundary, without the band and the bottom.
+    Vertex 0 is the pole at (0, 0, 1). Faces 0 to ``valence - 1`` are its one-ring, counter-clockwise, and each begins
+    at vertex 0. Without ``closed`` the cage is a dome with boundary, without the band and the bottom. Raises CageError
+    if ``valence < 3``.
     """
     if valence < 3:
         raise CageError(f"extraordinary vertex of valence {valence}; expected at least 3")

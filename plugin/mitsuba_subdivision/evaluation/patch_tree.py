@@ -50,17 +50,11 @@ class PartKind(IntEnum):
 
 
 class PatchTree:
-    """The elements of one signature, and the parts that they are divided into.
-
-    Attributes
-    ----------
-    control_count : int
-        K, number of control points of the element's one-ring.
-    """
+    """The elements of one signature, and the parts that they are divided into."""
 
     def __init__(self, scheme: Scheme, signature: Signature) -> None:
         self.scheme, self.signature = scheme, signature
-        self.control_count = one_ring(signature).vertex_count
+        self.control_count = one_ring(signature).vertex_count  # K, of the element's one-ring
         self._children: list[tuple[PatchTree, FloatArray]] = []
 
     @cached_property

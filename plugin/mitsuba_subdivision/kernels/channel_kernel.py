@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING
 
 import drjit as dr
 
 from ..mesh.shared import shared
+from ..patches.channel import Channel
 from ..patches.piece_table import PieceTable
 from .algebra import Monomials
 from .array_types import ArrayTypes, Float, Index, Mask, Value
 from .linear_maps import CoefficientMap, ControlValues, SparseMatrix
+from .locations import Location
 from .piece_kernel import PatchValues, PieceKernel
-
-if TYPE_CHECKING:
-    from ..patches.channel import Channel
-    from .locations import Location
 
 # Exponents of the monomials 1, u, v and, on the square, u v.
 _POWERS = ((0, 0), (1, 0), (0, 1), (1, 1))

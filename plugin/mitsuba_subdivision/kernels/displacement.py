@@ -15,17 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import drjit as dr
 
+from ..patches.channel import Channel
 from .algebra import added, cross, dot, like, unit
 from .array_types import Float, Index, Mask, Value
+from .channel_kernel import ChannelKernel
 from .piece_kernel import PatchValues, Piece, differences
-
-if TYPE_CHECKING:
-    from ..patches.channel import Channel
-    from .channel_kernel import ChannelKernel
 
 # Minimum cosine of the angle between the normal and the cross product of the derivatives at which these span the
 # tangent plane. Derivatives are parallel at extraordinary points on borders, and their cross product is not normal at

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.shared import Content, Shared
-from ..patches.piece_table import NOTHING, PACKET, piece_packets
+from ..patches.piece_table import NOTHING, PACKET, PieceTable, piece_packets
 from .array_types import (
     NO_CONFLICTS,
     ArrayTypes,
@@ -35,8 +35,6 @@ from .array_types import (
 
 if TYPE_CHECKING:
     from scipy import sparse
-
-    from ..patches.piece_table import PieceTable
 
 _MATRICES: Shared[SparseMatrix] = Shared()
 _MADE: Shared[LaterArrays] = Shared()

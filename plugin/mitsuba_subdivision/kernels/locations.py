@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, cast
 import drjit as dr
 import numpy as np
 
-from ..patches.piece_table import CODE, CORNERS, FOLLOWING, NOTHING, PRECEDING, TWIN, WHOLE
+from ..patches.piece_table import CODE, CORNERS, FOLLOWING, NOTHING, PRECEDING, TWIN, WHOLE, PieceTable
 from ..schemes.domain import ParameterDomain
 from ..tessellation.uniform_grid import UniformGrid
 from .array_types import ArrayTypes, Float, Index, Index4, Mask
 
 if TYPE_CHECKING:
-    from ..patches.piece_table import PieceTable
     from ..tessellation.adaptive_grid import AdaptiveGrid
     from ..tessellation.vertex_table import VertexTable
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import drjit as dr
 
@@ -32,13 +32,11 @@ from ..patches.piece_table import (
     TURN,
     WHOLE,
     FrameKind,
+    PieceTable,
 )
 from .algebra import Monomials, added, combined, cross, like, selected
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Value, Vector3
 from .locations import ElementWalk, doublings, in_child, turn_matrix, turned
-
-if TYPE_CHECKING:
-    from ..patches.piece_table import PieceTable
 
 # Lower bound of the distance from an extraordinary point, in parameters of the tip, for computing its level: zero has
 # no exponent. No level is as deep as this.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
@@ -12,12 +11,10 @@ import numpy as np
 from ..evaluation.normals import LEAST_EXTENT, TANGENT_ROUNDING
 from ..mesh import ragged
 from ..patches.piece_table import PACKET
+from ..tessellation.vertex_table import VertexPolynomials, VertexTable
 from .algebra import AffineMap, Monomials, unit
 from .array_types import NO_CONFLICTS, ArrayTypes, Float, FloatBuffer, Index, IndexBuffer, Matrix4, Vector3
 from .linear_maps import SparseMatrix, WeightBlocks, attached
-
-if TYPE_CHECKING:
-    from ..tessellation.vertex_table import VertexPolynomials, VertexTable
 
 # Least divisor when `UnitNormal` divides a tangent by its longest component, so that the cross product neither under-
 # nor overflows. A shorter tangent means that the patch has collapsed to a point or a curve.

@@ -326,13 +326,9 @@ class Topology:
 
     @cached_property
     def vertex_fans(self) -> tuple[IntArray, IndexArray]:
-        """Outgoing half-edges of every inner vertex, counter-clockwise from its lowest.
+        """Offsets ``(n_v + 1,)``, and outgoing half-edges of every inner vertex, counter-clockwise from its lowest.
 
-        Returns
-        -------
-        offsets : (n_v + 1,) int64
-        half_edges : (n,) int32
-            Entries of vertex ``v`` are ``offsets[v]`` up to ``offsets[v + 1]``; border vertices have none.
+        Half-edges of vertex ``v`` are ``offsets[v]`` up to ``offsets[v + 1]``; border vertices have none.
         """
         counts = np.where(self.is_border_vertex, 0, self.vertex_face_count)
         offsets = ragged.offsets(counts)

@@ -275,18 +275,11 @@ def value_mesh(
 
     The rules are those of OpenSubdiv 3.5. An edge is a seam as a whole, even if its sides have the same index at one
     end. At a vertex without a seam the values follow the rule of the vertex on the surface: crease, dart or corner. At
-    a vertex with a seam each index has a separate rule. It is that of a corner
+    a vertex with a seam each index has a separate rule: that of a corner under the conditions of section 12 of
+    plugin/MATHEMATICS.md, otherwise that of a border.
 
-    - if the vertex is a corner of the surface or non-manifold, and in mode "boundaries";
-    - if the faces with this index are not all connected at the vertex, across edges that are neither seams nor creases;
-    - if only one face has this index, in every mode except "none";
-    - if the vertex has more than two indices, in "corners_plus1" and "corners_plus2";
-    - if the vertex has two indices, and the other is a corner by the second condition, in "corners_plus1" and
-      "corners_plus2", or by the third condition, in "corners_plus2";
-    - if a seam ends at the vertex inside the mesh, in "corners_plus2".
-
-    Otherwise the rule is that of a border. A semi-sharp vertex, or semi-sharp edges between the faces of an index, make
-    the index a corner until they have decayed. In "corners_plus1" and "corners_plus2", if a vertex has two indices, the
+    A semi-sharp vertex, or semi-sharp edges between the faces of an index, make the index a corner until they have
+    decayed. In "corners_plus1" and "corners_plus2", if a vertex has two indices, the
     semi-sharp edges of one also make the other a corner, if the other has no semi-sharp edges. Semi-sharp edges on a
     seam, and other edges across a seam, have no influence.
 

@@ -21,14 +21,7 @@ FEW_CORNERS = 8
 
 @dataclass(frozen=True, eq=False)
 class NonManifold:
-    """Non-manifold edges and vertices.
-
-    An edge is non-manifold if it has more than two faces, if its two faces traverse it in the same direction, if one
-    face has it twice, or if it joins a vertex to itself. Non-manifold edges are infinitely sharp. A vertex is
-    non-manifold if it has a non-manifold edge or several fans. It is then a corner, with one exception: a vertex with
-    two non-manifold edges and three or more fans, each of which runs from one of these edges to the other, is on a
-    crease along these edges.
-    """
+    """Non-manifold edges and vertices, by the rules that `ControlCage` states."""
 
     # (n_h,) bool: whether the edge of each half-edge is non-manifold. These half-edges have no twins.
     is_edge: NDArray[np.bool_]

@@ -202,11 +202,7 @@ class PatchTable:
         t, fans = self.elements, fan_codes(self.topology, near=self.scheme.has_local_borders)
         if t is not self.topology:
             fans = fans[self.half_edge_of_corner]
-        whole = t.face_offsets[:-1][self.is_whole]
-        if self.may_turn:
-            begins, whole_codes = self._turned_to_least(fans, whole)
-        else:
-            begins, whole_codes = whole, row_codes(self._keys(fans, whole, self.scheme.domain.corner_count))
+        begins, whole_codes = self._turned_to_least(fans, t.face_offsets[:-1][self.is_whole])
         if self.is_whole.all():
             return begins, whole_codes
         corners: list[IntArray] = [begins]
@@ -215,19 +211,14 @@ class PatchTable:
         sizes = t.face_sizes[t.face[partial]]
         for size in np.flatnonzero(np.bincount(sizes)).tolist():
             corners.append(partial[sizes == size])
+            # Codes of the fans at all corners, from the first one on, distinguish the signatures of patches.
+            columns, corner = [], corners[-1]
+            for _ in range(1 if self.scheme.element == "vertex" else size):
+                columns.append(fans[corner])
+                corner = t.next[corner]
             first_unused = 1 + max(int(codes_of_size.max(initial=0)) for codes_of_size in codes)
-            codes.append(row_codes(self._keys(fans, corners[-1], size)).astype(np.int64) + first_unused)
+            codes.append(row_codes(columns).astype(np.int64) + first_unused)
         return np.concatenate(corners, dtype=np.int32), np.concatenate(codes)
-
-    def _keys(self, fans: IntArray, corners: IntArray, corner_count: int) -> list[IntArray]:
-        """Columns that distinguish the signatures of patches: codes of the fans at all corners, from `corners` on."""
-        if self.scheme.element == "vertex":
-            return [fans[corners]]
-        columns = []
-        for _ in range(corner_count):
-            columns.append(fans[corners])
-            corners = self.elements.next[corners]
-        return columns
 
     def _turned_to_least(
         self,
@@ -236,19 +227,19 @@ class PatchTable:
     ) -> tuple[IndexArray, IntArray]:
         """Begin each whole element at the corner from which its code is least, so that rotated copies get equal codes.
 
-        Returns these corners and the codes.
+        Returns these corners, the first ones if patches may not turn, and the codes.
         """
         count = self.scheme.domain.corner_count
+        turn_count = count if self.may_turn else 1
         at_corners = fans[corners + np.arange(count)[:, None]]
-        if self.scheme.element == "vertex":
-            codes = row_codes([at_corners.ravel()])
-        else:
-            # Seen from another first corner, an element's columns are rotated.
-            around = np.concatenate([at_corners, at_corners], axis=None)
-            codes = row_codes([around[corner * len(corners) :][: at_corners.size] for corner in range(count)])
-        codes = codes.reshape(at_corners.shape)
+        # Seen from another first corner, an element's columns are rotated.
+        around = np.concatenate([at_corners, at_corners], axis=None)
+        columns = range(1 if self.scheme.element == "vertex" else count)
+        length = turn_count * len(corners)
+        codes = row_codes([around[column * len(corners) :][:length] for column in columns])
+        codes = codes.reshape(turn_count, len(corners))
         least, turns = codes[0].copy(), np.zeros(len(corners), dtype=np.int32)
-        for turn in range(1, count):
+        for turn in range(1, turn_count):
             is_less = codes[turn] < least
             turns[is_less] = turn
             np.minimum(least, codes[turn], out=least)

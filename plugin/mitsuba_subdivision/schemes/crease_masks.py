@@ -1,23 +1,9 @@
 """Masks at borders, creases, corners and semi-sharp features, and their refinement, for Catmull-Clark and Loop.
 
-A mask is the set of weights of coarse vertices for a refined vertex. The mask of a vertex depends on its number of
-sharp edges; a border edge is sharp.
-
-================  ======================================  ==================================
-vertex            sharp edges                             mask
-================  ======================================  ==================================
-smooth            none                                    the scheme's smooth mask
-dart              one                                     the scheme's smooth mask
-crease            two, with the far ends ``a`` and ``b``  ``(6 S + a + b) / 8``
-corner            three or more, or the vertex is sharp   ``S``: the vertex stays
-================  ======================================  ==================================
-
-The edge point of a sharp edge is its midpoint, if both halves of the edge stay sharp. Where edges or the vertex become
-smooth in a refinement, the masks before and after it are blended. The weight of the mask before is the mean sharpness
-of these features [DeRose et al. 1998; Hoppe et al. 1994].
-
-OpenSubdiv computes the same (`Sdc::Crease`, `Sdc::Scheme`, `Vtr::Refinement`). Chaikin's method may make an edge with a
-sharpness above one smooth; the weight of its midpoint is then above one, as in OpenSubdiv.
+A mask is the set of weights of coarse vertices for a refined vertex. That of a vertex depends on its number of sharp
+edges; a border edge is sharp. Where edges or the vertex become smooth in a refinement, the masks before and after it
+are blended. Sections 10 and 11 of plugin/MATHEMATICS.md have the masks and the blend. OpenSubdiv computes the same
+(`Sdc::Crease`, `Sdc::Scheme`, `Vtr::Refinement`).
 """
 
 from __future__ import annotations

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
@@ -11,11 +9,9 @@ from ..cage import ControlCage
 from ..cage.errors import CageError, in_digits
 from ..evaluation.equations import EVALUATORS, Evaluator
 from ..mesh.connectivity import VertexRule
+from ..patches.patch_table import PatchTable
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
-
-if TYPE_CHECKING:
-    from ..patches.patch_table import PatchTable
 
 # Distance by which rounding may put a parameter outside its domain.
 DOMAIN_TOLERANCE = 1e-12
