@@ -57,19 +57,17 @@ def test_the_page_has_every_row_and_the_arrays_of_exact_shading():
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
 def test_a_description_names_all_choices(row):
     choices = {*row.choices, *RULES.get(row.name, ())} - {row.default}
-    assert [choice for choice in choices if f"``{choice}``" not in row.description] == []
+    assert [choice for choice in choices if f"``{choice}``" not in row.text] == []
     assert row.default is None or not row.choices or row.default in row.choices
-    assert row.description[0].isupper() or row.description.startswith("``")
-    assert not row.description.endswith(".")
+    assert row.text[0].isupper() or row.text.startswith("``")
+    assert not row.text.endswith(".")
 
 
 @pytest.mark.parametrize("row", [row for row in ROWS if row.default is not None], ids=lambda row: row.name)
 def test_a_stated_default_is_the_value_as_scene_files_have_it(row):
-    stated = row.default_text or re.search(r"\(Default: ``(.*)``\)$|\(Default: (.*)\)$", row.text)
-    if not isinstance(stated, str):
-        stated = stated[1] or stated[2]
-        kinds = {bool: {"true": True, "false": False}.get, str: str}
-        assert kinds.get(type(row.default), float)(stated) == row.default
+    quoted, number = re.search(r"\(Default: (?:``(.*)``|(.*))\)$", row.text).groups()
+    read = {bool: {"true": True, "false": False}.get, str: str}.get(type(row.default), float)
+    assert read(quoted or number) == row.default
     assert row.checked(row.default) == row.default
 
 

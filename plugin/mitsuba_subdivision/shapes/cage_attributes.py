@@ -98,9 +98,11 @@ class CageAttributes:
 
     def set_triangles(self, attributes: AttributeTable) -> None:
         """Set the tessellation whose vertices have attributes."""
-        self._loaded = attributes.values
-        shown = {name: values for name, values in self._loaded.items() if name in self._channels}
-        self._uploaded = {name: self._upload(values.astype(np.float32)) for name, values in shown.items()}
+        self._uploaded = {
+            name: self._upload(values.astype(np.float32))
+            for name, values in attributes.values.items()
+            if name in self._channels
+        }
         self._locations = attributes.layout.locate
         self._weights: dict[ChannelLayout, Any] = {}
 
@@ -128,10 +130,12 @@ class CageAttributes:
 
     def buffers(self, names: Iterable[str] | None = None) -> dict[str, FloatBuffer]:
         """Mesh buffers of the given attributes, by default of all, by name of the buffer."""
-        attributes = self._channels if names is None else names
-        values = {name: self._at_vertices(name) for name in attributes if name in self._loaded}
-        values |= {name: self._upsampling[name].stored(values[name]) for name in values if name in self._upsampling}
-        return {mesh_name(name): of_vertices for name, of_vertices in values.items()}
+        buffers = {}
+        for name in self._channels if names is None else names:
+            if name in self._uploaded:
+                values = self._at_vertices(name)
+                buffers[mesh_name(name)] = self._upsampling[name].stored(values) if name in self._upsampling else values
+        return buffers
 
     def _upload(self, values: NDArray[np.floating]) -> SharedArray:
         """Flat array of values; in JIT variants, meshes with equal values share it."""

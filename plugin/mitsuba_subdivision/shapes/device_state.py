@@ -11,8 +11,8 @@ import gc
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache, partial
-from types import MethodType, SimpleNamespace
+from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import drjit as dr
@@ -142,10 +142,6 @@ def _arrays_in(value: Any, seen: set[int]) -> Iterator[Any]:
     elif isinstance(value, (dict, list, tuple)):
         for item in value.values() if isinstance(value, dict) else value:
             yield from _arrays_in(item, seen)
-    elif isinstance(value, partial):
-        yield from _arrays_in(value.func, seen)
-    elif isinstance(value, MethodType):
-        yield from _arrays_in(value.__self__, seen)
     elif isinstance(value, SharedArray) or (kind.__module__.startswith(_PACKAGES) and hasattr(value, "__dict__")):
         for name in getattr(kind, "UPLOADED_LATER", ()):
             getattr(value, name)

@@ -253,18 +253,12 @@ class Parameter:
 
     name: str
     type: str
-    description: str  # Without a full stop at the end
-    default: Any  # None if there is no default
-    default_text: str  # Description of the default; empty if there is none
+    text: str  # Description and default, in one table cell as in Mitsuba's documentation
+    default: Any  # None if there is no default, or none that is a single value
     flags: tuple[str, ...]
     choices: tuple[str, ...]  # Values that a string may have; empty for any
     accepts: Callable[[Any], bool] | None  # Predicate for values of the right type
     expected: str  # Description of accepted values, for messages
-
-    @property
-    def text(self) -> str:
-        """Description and default, in one table cell as in Mitsuba's documentation."""
-        return f"{self.description}. (Default: {self.default_text})" if self.default_text else self.description
 
     def checked(self, value: Any) -> Any:
         """Return ``value``. Raises ValueError if its type is wrong, or it is not allowed."""
@@ -286,15 +280,14 @@ def _parameter(entry: str) -> Parameter:
     head, *values = re.split(r" = | \| ", head)
     stated = values[0] if values else ""
     name, kind = head.split(" : ")
-    description, _, default_text = " ".join(map(str.strip, lines)).partition(" (Default: ")
+    text = " ".join(map(str.strip, lines))
     if stated:
-        default_text = stated if kind in ("int", "float") else f"``{stated}``"
+        text += f" (Default: {stated})" if kind in ("int", "float") else f" (Default: ``{stated}``)"
     return Parameter(
         name,
         kind,
-        description.removesuffix("."),
+        text.removesuffix("."),
         _TYPES[kind][2](stated) if stated else None,
-        default_text.removesuffix(")"),
         tuple(flags.split(", ")) if flags else (),
         tuple(values) if len(values) > 1 else (),
         *_NUMBERS.get(name, (None, "")),

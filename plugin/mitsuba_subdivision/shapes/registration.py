@@ -44,11 +44,7 @@ _stack = threading.local()
 def register() -> None:
     """Register the plugins for loaded variants now, and for others when they are first set. Idempotent."""
     mi.detail.add_variant_callback(_on_variant_change)
-    current = mi.variant()
-    if current is None:
-        _register_loaded_variants()
-    else:
-        _on_variant_change(None, current)
+    _on_variant_change(None, mi.variant())
 
 
 def register_variant(variant: ModuleType | str) -> type:
@@ -86,13 +82,9 @@ def register_variant(variant: ModuleType | str) -> type:
         return _registered[name]
 
 
-def _on_variant_change(_old: str | None, new: str) -> None:
-    if new.startswith("llvm"):
+def _on_variant_change(_old: str | None, new: str | None) -> None:
+    if new is not None and new.startswith("llvm"):
         warn_if_unusable()
-    _register_loaded_variants()
-
-
-def _register_loaded_variants() -> None:
     for variant in mi.variants():
         # Variants are loaded when they are first set or accessed; loading all of them would take seconds.
         if f"mitsuba.{variant}" in sys.modules:
