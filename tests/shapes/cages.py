@@ -17,7 +17,8 @@ def cube(**tags):
 
 
 def described(cage, **parameters):
-    return {"type": "subdivision", **cage.as_properties(mi), **parameters}
+    rate = {} if "tessellation" in parameters else {"tessellation_rate": 4}
+    return {"type": "subdivision", **cage.as_properties(mi), **rate, **parameters}
 
 
 def load(cage, **parameters):

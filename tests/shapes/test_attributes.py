@@ -16,10 +16,6 @@ from shapes.updates import update
 from shapes.variants import every_array_variant, every_variant, exact, llvm, shadings
 
 
-def make(cage, **parameters):
-    return load(cage, **{"tessellation_rate": 4, **parameters})
-
-
 @llvm
 def test_rendering_takes_the_same_kernels_wherever_arrays_lie():
     """Texture coordinates are read in packets where they are aligned, and one by one where they are not."""
@@ -29,7 +25,7 @@ def test_rendering_takes_the_same_kernels_wherever_arrays_lie():
     kernels, kept = set(), []
     for count in range(12):
         kept.append(np.empty(40 * count, dtype=np.uint8))
-        shape = make(cage)
+        shape = load(cage)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
             dr.kernel_history_clear()
             dr.eval(hit(shape).uv)
@@ -186,7 +182,7 @@ def test_textured_emitters_light_as_with_vertex_shading(kind, displacement):
     for shading in ("exact", "vertex"):
         radiance = {"data": upload(mi.TensorXf, texels), "raw": True} if kind == "bitmap" else {}
         emitter = {"type": "area", "radiance": {"type": kind, **radiance}}
-        shape = make(cage, shading=shading, emitter=emitter, **displacement)
+        shape = load(cage, shading=shading, emitter=emitter, **displacement)
         scene = scene_with(integrator={"type": "path"}, shape=shape, **seen)
         si = scene.ray_intersect(down(1.9, 0.3, 4))
         drawn = (scene.sample_emitter_direction(si, mi.Point2f(*xy), False)[0] for xy in ([0.2, 0.7], [0.9, 0.4]))
@@ -198,14 +194,14 @@ def test_textured_emitters_light_as_with_vertex_shading(kind, displacement):
 
 @every_variant
 def test_what_users_assign_to_vertices_stays_until_the_cage_is_updated_for_which_alone_weights_are_made(monkeypatch):
-    shape = make(with_attributes(cube()))
+    shape = load(with_attributes(cube()))
     parameters = mi.traverse(shape)
     assigned = upload(type(parameters["vertex_colour"]), 0.5 * np.array(parameters["vertex_colour"]))
     update(parameters, vertex_colour=assigned, cage_weight=parameters["cage_weight"] * 2)
     with monkeypatch.context() as patched:
         patched.setattr(Channel, "weights", None)
         update(parameters, control_points=parameters["control_points"] * 2)
-        update(make(with_attributes(cube())), control_points=parameters["control_points"])
+        update(load(with_attributes(cube())), control_points=parameters["control_points"])
     np.testing.assert_array_equal(np.array(mi.traverse(shape)["vertex_colour"]), np.array(assigned))
     parameters["cage_colour"] = parameters["cage_colour"] * 1
     parameters.set_dirty("cage_colour")

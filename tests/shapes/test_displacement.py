@@ -27,6 +27,7 @@ HIT, HIT_NORMAL, HIT_DERIVATIVE = 1e-5, 1e-3, 1e-2
 WIDE, NORMAL_DERIVATIVE = 1e-3, 0.05
 # Beside extraordinary vertices, in parameters; and how far normals turn there where the surface is curved.
 BESIDE, AROUND = 2.0**-5, 0.04
+# No vertex lies on a line between texels, where slopes jump.
 RATE, FINE = 5, 24
 SCALE = 0.15
 IMAGE = np.random.default_rng(7).random((5, 8)).astype(np.float32)
@@ -141,7 +142,7 @@ def test_vertices_lie_on_the_displaced_surface_with_its_normals(name, kind, to_w
     p, n = vertices(make(cage, heights(kind), to_world, scheme=scheme))
     truth = Truth(cage, kind, to_world, scheme)
     inside = truth.surface.scheme.domain.inside(uv) > 2 * STEP
-    assert inside.sum() > min(len(uv) / 4, 90)
+    assert inside.sum() > len(uv) / 5
     np.testing.assert_allclose(p[inside], truth.points(corner[inside], uv[inside]), rtol=0, atol=6 * SINGLE)
     np.testing.assert_allclose(n[inside], truth.normals(corner[inside], uv[inside]), rtol=0, atol=NORMAL)
 
@@ -460,7 +461,7 @@ def test_normals_turn_when_texture_coordinates_slide_over_a_bitmap():
     cage = cube(texcoords=np.stack([0.3 * x + 0.11 * z + 0.5, 0.3 * y + 0.23 * z + 0.5], axis=1))
     t, s = np.meshgrid(*[(np.arange(256) + 0.5) / 256] * 2, indexing="ij")
     image = bitmap((np.sin(4 * np.pi * s) * np.cos(2 * np.pi * t))[:, :, None].astype(np.float32))
-    parameters = mi.traverse(load(cage, tessellation_rate=4, displacement=image, displacement_scale=0.02))
+    parameters = mi.traverse(load(cage, displacement=image, displacement_scale=0.02))
     given = mi.Float(parameters["cage_texcoords"])
     way = upload(mi.Float, np.random.default_rng(1).normal(size=dr.width(given)))
 

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision import upload
-from shapes.cages import cube, described, load
+from shapes.cages import cube, load
 from shapes.scenes import vertices
 from shapes.updates import update
 from shapes.variants import every_variant
@@ -116,7 +116,7 @@ ADAPTIVE = {"tessellation": "adaptive"}
 )
 @every_variant
 def test_errors_say_what_was_expected(parameters, message):
-    given = described(CAGE)
+    given = {"type": "subdivision", **CAGE.as_properties(mi)}
     for name, value in parameters.items():
         if isinstance(value, np.ndarray):
             kind = mi.TensorXf if value.dtype == float else mi.TensorXu

@@ -13,8 +13,6 @@ from shapes.variants import exact, shadings
 
 # A scene that is freed while a function is being frozen, or before it runs again, is one that Dr.Jit misses.
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb", "no_other_scene")
-KEYS = {"points": "control_points", "world": "to_world", "scale": "displacement_scale"}
-KEYS |= {"colour": "cage_colour", "texcoords": "cage_texcoords"}
 # Dr.Jit adds gradients of pixels in no fixed order.
 ORDER_OF_SUMS = 1e-5
 
@@ -24,80 +22,87 @@ def loaded(shading, **parameters):
     rng = np.random.default_rng(0)
     texcoords = Attribute(rng.random((8, 2)), "varying")
     cage = cube(texcoords=texcoords, attributes={"colour": rng.random((8, 3)), "height": rng.random((8, 1))})
-    rate = {} if "tessellation" in parameters else {"tessellation_rate": 2}
     bsdf = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}}
     # One hit takes less time to compile than paths of light.
     integrator = {"type": "aov", "aovs": "normals:sh_normal,colours:albedo,texcoords:uv"}
     sensor = perspective({"type": "hdrfilm", "width": 8, "height": 8}, [4, -6, 4])
-    shape = described(cage, shading=shading, bsdf=bsdf, **rate, **parameters)
-    scene = scene_with(integrator=integrator, sensor=sensor, shape=shape)
+    scene = scene_with(
+        integrator=integrator, sensor=sensor, shape=described(cage, shading=shading, bsdf=bsdf, **parameters)
+    )
     return scene, mi.traverse(scene)
 
 
-# Kernels of displaced surfaces take longest to compile.
-NEEDED = {"scale": {"displacement": "vertex_height", "displacement_scale": 0.1}}
+DISPLACED = {"displacement": "vertex_height", "displacement_scale": 0.1}
 
 
-def value(by, number):
-    """New values of a parameter on the device, which no kernel has compiled in."""
-    if by == "points":
-        return upload(mi.Float, cube().positions * (1 + number / 10))
-    if by in ("colour", "texcoords"):
-        return upload(mi.Float, np.linspace(0, number / 5, 24 if by == "colour" else 16))
+def values(by, number):
+    """New values of parameters on the device, which no kernel has compiled in."""
     tenths = dr.opaque(mi.Float, number / 10)
-    return mi.Transform4f().translate([tenths, 0, 0]) if by == "world" else tenths
+    every = {
+        "control_points": upload(mi.Float, cube().positions * (1 + number / 10)),
+        "to_world": mi.Transform4f().translate([tenths, 0, 0]),
+        "displacement_scale": tenths,
+        "cage_colour": upload(mi.Float, np.linspace(0, number / 5, 24)),
+        "cage_texcoords": upload(mi.Float, np.linspace(0, number / 5, 16)),
+    }
+    return {f"shape.{name}": every[name] for name in by}
 
 
-@shadings
-@pytest.mark.parametrize("by", KEYS)
-def test_updates_inside_of_a_frozen_function_are_recorded(shading, by):
+SURFACE, COLOURS = ("control_points", "to_world"), ("cage_colour", "cage_texcoords")
+# What is updated at once, in a scene that has it all.
+TOGETHER = [
+    ("vertex", (*SURFACE, "displacement_scale", *COLOURS), DISPLACED),
+    pytest.param("exact", (*SURFACE, *COLOURS), {}, marks=exact),
+    pytest.param("exact", ("displacement_scale",), DISPLACED, marks=exact),
+    ("vertex", ("cage_colour",), {}),
+    pytest.param("exact", ("cage_colour",), {}, marks=exact),
+]
+
+
+@pytest.mark.parametrize(("shading", "by", "given"), TOGETHER)
+def test_updates_inside_of_a_frozen_function_are_recorded(shading, by, given):
     """Earlier, memory of NumPy that was dropped during the recording ended the process, and checks read arrays."""
 
     def step(scene, parameters, values):
-        update(parameters, {f"shape.{KEYS[by]}": values})
+        update(parameters, values)
         return mi.render(scene, spp=2)
 
-    numbers = range(1, 4 if by == "colour" else 3)
-    expected = [np.array(step(*loaded(shading, **NEEDED.get(by, {})), value(by, number))) for number in numbers]
-    frozen, (scene, parameters) = dr.freeze(step), loaded(shading, **NEEDED.get(by, {}))
-    # Mitsuba renders what was recorded twice: once more when arrays have become the function's own.
-    for number in range(1, 3):
-        picture = np.array(frozen(scene, parameters, value(by, number)))
-        np.testing.assert_array_equal(picture, expected[number - 1])
-    assert frozen.n_recordings == 2
-    if by == "colour":
-        np.testing.assert_allclose(np.array(frozen(scene, parameters, value(by, 3))), expected[2], rtol=ORDER_OF_SUMS)
-        assert frozen.n_recordings == 2
+    # Mitsuba renders what was recorded twice: once more when arrays have become the function's own. Of surfaces that
+    # move, no more.
+    numbers = range(1, 4 if by == ("cage_colour",) else 3)
+    expected = [np.array(step(*loaded(shading, **given), values(by, number))) for number in numbers]
+    frozen, (scene, parameters) = dr.freeze(step), loaded(shading, **given)
+    for number in numbers:
+        picture = np.array(frozen(scene, parameters, values(by, number)))
+        np.testing.assert_allclose(picture, expected[number - 1], rtol=ORDER_OF_SUMS if number == 3 else 0)
+        assert frozen.n_recordings == min(number, 2)
 
 
 def loss_of(scene, parameters, seed):
     return dr.mean(dr.square(mi.render(scene, parameters, spp=2, seed=seed) - 0.5), axis=None)
 
 
-@pytest.mark.parametrize(
-    ("shading", "by"), [*(("vertex", by) for by in KEYS), pytest.param("exact", "points", marks=exact)]
-)
-def test_gradients_of_a_frozen_picture_reach_what_was_updated_before(shading, by):
+@pytest.mark.parametrize(("shading", "by", "given"), TOGETHER[:2])
+def test_gradients_of_a_frozen_picture_reach_what_was_updated_before(shading, by, given):
     def picture(scene, parameters, seed):
         loss = loss_of(scene, parameters, seed)
         dr.backward(loss)
         return dr.detach(loss)
 
-    def gradient(picture, scene, parameters, number):
-        values = value(by, number)
-        leaf = values.matrix if by == "world" else values
-        dr.enable_grad(leaf)
-        update(parameters, {f"shape.{KEYS[by]}": values})
+    def gradients(picture, scene, parameters, number):
+        new = values(by, number)
+        leaves = [getattr(value, "matrix", value) for value in new.values()]
+        dr.enable_grad(leaves)
+        update(parameters, new)
         picture(scene, parameters, dr.opaque(mi.UInt32, number))
-        return np.array(dr.grad(leaf))
+        return [np.array(dr.grad(leaf)) for leaf in leaves]
 
-    plain, frozen = (loaded(shading, **NEEDED.get(by, {})) for _ in range(2))
-    function = dr.freeze(picture)
+    plain, frozen, function = loaded(shading, **given), loaded(shading, **given), dr.freeze(picture)
     for number in range(1, 4):
-        expected = gradient(picture, *plain, number)
-        assert abs(expected).max() > 0
-        frozen_gradient = gradient(function, *frozen, number)
-        np.testing.assert_allclose(frozen_gradient, expected, atol=ORDER_OF_SUMS * abs(expected).max())
+        pairs = zip(gradients(picture, *plain, number), gradients(function, *frozen, number), strict=True)
+        for name, (expected, gradient) in zip(by, pairs, strict=True):
+            assert abs(expected).max() > 0
+            np.testing.assert_allclose(gradient, expected, atol=ORDER_OF_SUMS * abs(expected).max(), err_msg=name)
     assert function.n_recordings == 2
 
 
@@ -105,15 +110,15 @@ def test_gradients_of_a_frozen_picture_reach_what_was_updated_before(shading, by
 def test_steps_of_colours_are_frozen_whole(shading):
     def step(scene, parameters, colours, seed):
         dr.enable_grad(colours)
-        update(parameters, {"shape.cage_colour": colours})
+        update(parameters, colours)
         dr.backward(loss_of(scene, parameters, seed))
-        return dr.grad(colours)
+        return dr.grad(colours["shape.cage_colour"])
 
     plain, frozen, function = loaded(shading), loaded(shading), dr.freeze(step)
     for number in range(1, 4):
         seed = dr.opaque(mi.UInt32, number)
-        expected = np.array(step(*plain, value("colour", number), seed))
-        frozen_gradient = np.array(function(*frozen, value("colour", number), seed))
+        expected = np.array(step(*plain, values(["cage_colour"], number), seed))
+        frozen_gradient = np.array(function(*frozen, values(["cage_colour"], number), seed))
         np.testing.assert_allclose(frozen_gradient, expected, atol=ORDER_OF_SUMS * abs(expected).max())
     assert function.n_recordings == 2
 
@@ -121,18 +126,18 @@ def test_steps_of_colours_are_frozen_whole(shading):
 def test_what_a_frozen_function_cannot_do_is_told():
     """Mitsuba's own meshes cannot, either; and Dr.Jit goes on reading triangles that it has read."""
 
-    def step(scene, parameters, key, values):
+    def step(scene, parameters, values):
         dr.enable_grad(values)
-        update(parameters, {key: values})
+        update(parameters, values)
         return mi.render(scene, spp=1)
 
     adaptive = {"tessellation": "adaptive", "chord_error": 0.1}
-    for parameters, key, values, cause in (
-        ({}, "shape.control_points", value("points", 1), "update them before"),
-        (adaptive, "shape.chord_error", dr.opaque(mi.Float, 0.2), "a frozen function has read the triangles"),
+    for parameters, given, cause in (
+        ({}, values(["control_points"], 1), "update them before"),
+        (adaptive, {"shape.chord_error": dr.opaque(mi.Float, 0.2)}, "a frozen function has read the triangles"),
     ):
         with pytest.raises(RuntimeError, match="recording") as error:
-            dr.freeze(step)(*loaded("vertex", **parameters), key, values)
+            dr.freeze(step)(*loaded("vertex", **parameters), given)
         assert cause in str(error.value.__cause__)
     scene, parameters = loaded("vertex", **adaptive)
     shape = scene.shapes()[0]
@@ -140,6 +145,6 @@ def test_what_a_frozen_function_cannot_do_is_told():
     dr.freeze(lambda scene: mi.render(scene, spp=1))(scene)
     with pytest.raises(RuntimeError, match="a frozen function has read the triangles of this shape; choose others"):
         shape.retessellate()
-    for key, values in (("chord_error", 0.2), ("to_world", mi.Transform4f().scale([-1, 1, 1]))):
+    for key, value in (("chord_error", 0.2), ("to_world", mi.Transform4f().scale([-1, 1, 1]))):
         with pytest.raises(RuntimeError, match="or load the scene anew"):
-            update(parameters, {f"shape.{key}": values})
+            update(parameters, {f"shape.{key}": value})

@@ -16,7 +16,7 @@ from mitsuba_subdivision.shapes import registration, subdivision_shape
 from mitsuba_subdivision.shapes.device_state import paused_collection
 from patches.closed_cages import torus
 from reference.refined_cages import tagged
-from shapes.cages import RING, cube, described
+from shapes.cages import RING, cube, described, load
 from shapes.updates import update
 from shapes.variants import every_array_variant, every_variant, exact, llvm, scalar, shadings
 
@@ -39,15 +39,6 @@ def coloured(cage, seed=0, **attributes):
     return tagged(cage, texcoords=texcoords, attributes={"colour": rng.random((cage.vertex_count, 3)), **attributes})
 
 
-def of(cage, **parameters):
-    rate = {} if "tessellation" in parameters else {"tessellation_rate": 2}
-    return described(cage, **{**rate, **parameters})
-
-
-def made(cage, **parameters):
-    return mi.load_dict(of(cage, **parameters))
-
-
 def buffers(shape):
     parameters = mi.traverse(shape)
     return {name: np.array(parameters[name]) for name in BUFFERS if name in parameters}
@@ -57,7 +48,7 @@ def placed(shape, i):
     return {**shape, "to_world": mi.ScalarTransform4f().translate([i % 8, i // 8 % 8, i // 64])}
 
 
-def load(shapes, **options):
+def loaded_together(shapes, **options):
     named = {f"s{i:04}": placed(shape, i) for i, shape in enumerate(shapes)}
     return mi.load_dict({"type": "scene", **named}, **options).shapes()
 
@@ -79,8 +70,8 @@ WAITING = [
 )
 def test_many_shapes_load(count, parallel, kinds):
     cage = coloured(cube(), height=np.linspace(0, 1, 8)[:, None]) if len(kinds) > 1 else cube()
-    shapes = [of(cage, **kinds[i % len(kinds)]) for i in range(count)]
-    loaded = load(shapes, parallel=parallel)
+    shapes = [described(cage, **kinds[i % len(kinds)]) for i in range(count)]
+    loaded = loaded_together(shapes, parallel=parallel)
     assert len(loaded) == count
     for i in (0, count // 2, *range(count - len(kinds), count)):
         expected, buffers_ = buffers(mi.load_dict(placed(shapes[i], i))), buffers(loaded[i])
@@ -92,7 +83,7 @@ def test_many_shapes_load(count, parallel, kinds):
 @llvm
 def test_an_error_in_one_of_many_shapes_is_that_of_the_load():
     with pytest.raises(RuntimeError, match='parameter "tessellation_rate" is 0; expected 1 to'):
-        load([*[of(cube())] * SOME, {**of(cube()), "tessellation_rate": 0}])
+        loaded_together([*[described(cube())] * SOME, {**described(cube()), "tessellation_rate": 0}])
 
 
 def test_a_constructor_too_deep_runs_in_its_own_thread():
@@ -129,7 +120,7 @@ def test_the_collector_rests_while_a_shape_is_made_and_is_as_it_was_afterwards(m
         return read_parameters(props)
 
     monkeypatch.setattr(subdivision_shape, "read_parameters", noted)
-    made(cube())
+    load(cube())
     assert gc.isenabled()
     # Also after a shape that is refused, and where it was off.
     with pytest.raises(RuntimeError, match="filename"):
@@ -137,7 +128,7 @@ def test_the_collector_rests_while_a_shape_is_made_and_is_as_it_was_afterwards(m
     assert gc.isenabled()
     gc.disable()
     try:
-        made(cube())
+        load(cube())
         assert not gc.isenabled()
     finally:
         gc.enable()
@@ -184,7 +175,7 @@ def test_shapes_of_equal_topology_share_all_but_positions(shading, tmp_path, np_
         with pytest.warns(CageWarning, match="no place for attribute"):
             given.save(path)
     options = {"shading": shading, "tessellation_rate": 3}
-    from_arrays = [mi.load_dict({**of(given), **options}) for given in (cage, moved, coloured(cage, 1))]
+    from_arrays = [mi.load_dict({**described(given), **options}) for given in (cage, moved, coloured(cage, 1))]
     files = [from_file(path, **options) for path in (*paths, paths[0])]
     for first, *others in (from_arrays, files):
         for shape in others:
@@ -214,7 +205,7 @@ def test_shapes_of_equal_topology_share_all_but_positions(shading, tmp_path, np_
     ids=str,
 )
 def test_shapes_of_other_tags_rules_or_schemes_share_no_patches_and_those_of_another_rate_only_these(tags, parameters):
-    one, two = made(cube()), made(cube(**tags), **parameters)
+    one, two = load(cube()), load(cube(**tags), **parameters)
     assert one._mesh.table is not two._mesh.table
     share = one._parameters.surface.patches is two._parameters.surface.patches
     assert share == ("tessellation_rate" in parameters)
@@ -226,7 +217,7 @@ def test_shapes_of_equal_cages_share_arrays_until_those_of_one_change(shading):
     points, is_jit = cube().positions, dr.is_jit_v(mi.Float)
     cage = cube(creases=RING, texcoords=points[:, :2], attributes={"colour": points})
     given = cage, cage, cage.with_positions(-cage.positions)
-    one, two, moved = (mi.traverse(made(cage, shading=shading)) for cage in given)
+    one, two, moved = (mi.traverse(load(cage, shading=shading)) for cage in given)
     # Normals, or what they come from.
     placed = ("vertex_positions", "shading_coefficients" if shading == "exact" else "vertex_normals")
     values = ("vertex_colour", "cage_colour", "cage_texcoords")
@@ -244,7 +235,7 @@ def test_shapes_of_equal_cages_share_arrays_until_those_of_one_change(shading):
         np.testing.assert_allclose(np.array(one[name]), factor * before[name], atol=10 * SINGLE)
     if is_jit:
         dr.scatter(two["vertex_positions"], 7.0, dr.uint32_array_t(type(two["vertex_positions"]))(0))
-    anew = mi.traverse(made(cage, shading=shading))
+    anew = mi.traverse(load(cage, shading=shading))
     for name, expected in before.items():
         np.testing.assert_array_equal(np.array(anew[name]), expected)
         if name != "vertex_positions":
@@ -254,7 +245,7 @@ def test_shapes_of_equal_cages_share_arrays_until_those_of_one_change(shading):
 @exact
 @every_array_variant
 def test_nothing_is_kept_when_the_last_shape_has_gone():
-    shape = of(coloured(torus(4, 3)), shading="exact")
+    shape = described(coloured(torus(4, 3)), shading="exact")
     one, two = mi.load_dict(shape), mi.load_dict(shape)
     seen = [weakref.ref(reference) for reference in tables(one)]
     del one
@@ -277,7 +268,7 @@ def written(cage, path, age=LONG_AGO, more=""):
 
 
 def from_file(path, **more):
-    return mi.load_dict({"type": "subdivision", "filename": path, "tessellation_rate": 2, **more})
+    return mi.load_dict({"type": "subdivision", "filename": path, "tessellation_rate": 4, **more})
 
 
 def cage_of(shape):
@@ -313,7 +304,7 @@ def test_only_usd_files_refer_to_others_which_may_change_alone():
 
 @llvm
 def test_triangles_that_are_chosen_anew_keep_derivatives():
-    shape = made(cube())
+    shape = load(cube())
     dr.enable_grad(mi.traverse(shape)["control_points"])
     shape.retessellate()
     dr.backward(dr.sum(mi.traverse(shape)["vertex_positions"]))

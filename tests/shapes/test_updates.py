@@ -7,7 +7,7 @@ import pytest
 from mitsuba_subdivision import upload
 from patches.closed_cages import cube_with_hexagon, extraordinary_triangles
 from reference.refined_cages import refine_first
-from shapes.cages import cube, described, with_attributes
+from shapes.cages import bitmap, cube, described, with_attributes
 from shapes.scenes import buffer, rays, scene_with, vertices
 from shapes.updates import update
 from shapes.variants import every_variant, exact, llvm, shadings
@@ -48,38 +48,27 @@ CASES = [*((kind, "vertex") for kind in KINDS), *(pytest.param(kind, "exact", ma
 def state(kind, number):
     """A cage, and parameters of its shape: before an update of everything, 0, or after it, 1."""
     made, parameters = KINDS[kind]
-    plain, given = (
-        made(),
-        {name: value[number] if isinstance(value, list) else value for name, value in parameters.items()},
-    )
+    plain = made()
+    given = {name: value[number] if isinstance(value, list) else value for name, value in parameters.items()}
     aside = np.random.default_rng(number).normal(0, 0.1, plain.positions.shape)
     given["to_world"] = mi.ScalarTransform4f().rotate([1, 2, 0], 40).scale([1 - 2 * number, 1.2, 1.5])
     if given.get("displacement") == "bitmap":
-        bitmap = {"type": "bitmap", "data": upload(mi.TensorXf, HEIGHTS[number]), "raw": True}
-        given["displacement"] = {**bitmap, "to_uv": mi.ScalarTransform3f().rotate(20)}
+        given["displacement"] = bitmap(HEIGHTS[number], to_uv=mi.ScalarTransform3f().rotate(20))
     return with_attributes(plain.with_positions(plain.positions + aside), number), given
 
 
 def loaded(kind, number, shading, **more):
     cage, given = state(kind, number)
-    rate = {} if "tessellation" in given else {"tessellation_rate": 4}
-    return scene_with(shape=described(cage, shading=shading, **{**rate, **given, **more}))
+    return scene_with(shape=described(cage, shading=shading, **{**given, **more}))
 
 
 def assigned(kind, shown, number=1):
     """New values of all parameters of a scene that may be updated, by key."""
     cage, given = state(kind, number)
-    values = {
-        "control_points": cage.positions,
-        "displacement.data": HEIGHTS[number],
-        "cage_texcoords": cage.texcoords.values,
-    }
-    values |= {f"cage_{name}": attribute.values for name, attribute in cage.attributes.items()}
-    arrays = {key: values[name] for name in values if (key := f"shape.{name}") in {name for name, _ in shown}}
-    others = {
-        f"shape.{name}": given[name] for name in ("to_world", "displacement_scale", "chord_error") if name in given
-    }
-    return {key: upload(type(shown[key]), value) for key, value in arrays.items()} | others
+    values = {"control_points": cage.positions, "displacement.data": HEIGHTS[number]}
+    values |= {f"cage_{name}": a.values for name, a in {**cage.attributes, "texcoords": cage.texcoords}.items()}
+    arrays = {key: upload(type(shown[key]), values[name]) for name in values if (key := f"shape.{name}") in shown}
+    return arrays | {f"shape.{name}": given[name] for name in OTHERS if name in given}
 
 
 def numbers(value):
@@ -104,6 +93,7 @@ def assert_alike(scene, expected):
 
 
 PLACED = ("shape.vertex_positions", "shape.vertex_normals")
+OTHERS = ("to_world", "displacement_scale", "chord_error")
 
 
 def hits(scene, count=400):

@@ -31,7 +31,7 @@ def views_of(integrator, cage=None, resolution=16, **parameters):
     sensors = {f"view_{view}": perspective(resolution, eye, up=[0, 1, 0]) for view, eye in enumerate(eyes)}
     # Nothing here has shadows, whose derivatives would take seconds.
     integrator = {"type": integrator, **({"sppi": 0} if integrator.endswith("_projective") else {})}
-    shape = described(cage or cube(), tessellation_rate=4, **parameters)
+    shape = described(cage or cube(), **parameters)
     return scene_with(integrator=integrator, **sensors, sky={"type": "constant"}, shape=shape)
 
 
@@ -226,7 +226,7 @@ def test_derivatives_do_not_keep_shapes_alive(given, seen, shading):
 
 
 def test_edges_between_copies_of_vertices_are_no_outlines():
-    shape = load(SEAMED, tessellation_rate=4)
+    shape = load(SEAMED)
     parameters, faces = mi.traverse(shape), buffer(shape, "faces").ravel()
     edges = np.arange(len(faces))
     following = edges + np.where(edges % 3 == 2, -2, 1)
@@ -257,7 +257,7 @@ def test_a_user_may_assign_other_triangles():
 
 
 def test_surface_area_keeps_derivatives():
-    shape, size = load(SEAMED, tessellation_rate=4), dr.opaque(mi.Float, 1)
+    shape, size = load(SEAMED), dr.opaque(mi.Float, 1)
     parameters, before = mi.traverse(shape), shape.surface_area()[0]
     dr.enable_grad(size)
     update(parameters, control_points=mi.Float(parameters["control_points"]) * size)
