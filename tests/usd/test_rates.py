@@ -56,9 +56,7 @@ def _moved(*offset, scale=1.0):
 @pytest.mark.parametrize("columns", [8, 20, 60])
 def test_triangles_are_as_near_as_the_picture_shows_and_not_much_nearer(columns, shading):
     cage = torus(columns, columns // 2)
-    sensor = sensor_at(12.0)
-    rate = _rate(_shape(cage), sensor, shading)
-    surface = msub.LimitSurface(cage)
+    surface, rate = msub.LimitSurface(cage), _rate(_shape(cage), sensor_at(12.0), shading)
 
     def error(rate):
         """Of the middles of triangles and of their edges, as the nearest part of the torus shows it."""
@@ -74,27 +72,24 @@ def test_triangles_are_as_near_as_the_picture_shows_and_not_much_nearer(columns,
 
 @pytest.mark.core
 def test_segments_follow_the_size_in_the_picture():
-    cage = torus(8, 5)
-    near, far, larger = (_rate(_shape(cage), sensor) for sensor in (sensor_at(8), sensor_at(80), sensor_at(8, 2560)))
+    shape = _shape(torus(8, 5))
+    near, far, larger = (_rate(shape, sensor) for sensor in (sensor_at(8), sensor_at(80), sensor_at(8, 2560)))
     assert far < near < larger
     # Around the camera, a picture may show any part from near.
-    assert _rate(_shape(cage), sensor_at(0)) == FINEST_RATE
+    assert _rate(shape, sensor_at(0)) == FINEST_RATE
     # Four times the size, four times as far away.
-    assert _rate(_shape(cage, _moved(0, 0, 24, scale=4)), sensor_at(8)) == near
+    assert _rate(replace(shape, to_world=_moved(0, 0, 24, scale=4)), sensor_at(8)) == near
     wide = mi.ScalarTransform4f().translate([0, 0, -8]).scale([3, 3, 1])
     film = {"type": "hdrfilm", "width": WIDTH, "height": WIDTH}
     flat = {"type": "orthographic", "to_world": wide, "film": film, "near_clip": 0.01}
-    assert _rate(_shape(cage), flat) == _rate(_shape(cage, _moved(0, 0, 100)), flat) > 1
-
-
-def test_the_nearest_instance_decides():
-    shape = _shape(torus(8, 5))
+    assert _rate(shape, flat) == _rate(replace(shape, to_world=_moved(0, 0, 100)), flat) > 1
+    # The nearest instance decides.
     places = [InstanceContents(f"/{z}", 0, _moved(0, 0, z)) for z in (0, 40, 400)]
 
     def rate(instances):
         return _segments(SceneContents(groups=[[shape]], instances=instances), sensor_at(8), "exact")[shape]
 
-    assert rate(places) == rate(places[:1]) == _rate(shape, sensor_at(8)) > rate(places[1:]) > rate(places[2:])
+    assert rate(places) == rate(places[:1]) == near > rate(places[1:]) > rate(places[2:])
 
 
 def test_still_pictures_have_adaptive_triangles_where_these_are_fewer():
@@ -148,17 +143,14 @@ def test_equal_cages_are_made_once_and_told_of_by_their_own_names():
     contents = replace(contents, positions=np.concatenate([contents.positions, np.ones((1, 3))]))
     one, other = (replace(contents, source=replace(contents.source, name=name)) for name in ("/left", "/right"))
     moved = replace(other, positions=other.positions + np.array([0, 0, 1.0]))
-    surfaces = Surfaces()
+    surfaces, entries = Surfaces(), []
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert surfaces.of(one) is surfaces.of(other)
-        assert surfaces.of(one) is not surfaces.of(moved)
-        assert surfaces.of(replace(one, scheme="doo_sabin")) is not surfaces.of(one)
-    entries = []
+        assert surfaces.of(one) not in (surfaces.of(moved), surfaces.of(replace(one, scheme="doo_sabin")))
     for cage in (one, other, moved):
         notes = StageWarnings()
-        shape = ShapeContents(cage.source.name, cage, np.eye(4))
-        entries.append(subdivision(shape, surfaces, {}, None, {}, notes))
+        entries.append(subdivision(ShapeContents(cage.source.name, cage, np.eye(4)), surfaces, {}, None, {}, notes))
         with pytest.warns(CageWarning, match=f"^{cage.source.name}: 1 of 9 vertices"):
             notes.warn("stage")
     first, second, third = entries
@@ -166,13 +158,14 @@ def test_equal_cages_are_made_once_and_told_of_by_their_own_names():
     assert not np.array_equal(np.array(first["positions"]), np.array(third["positions"]))
 
 
-FACES = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
-POINTS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+CUBE = named_cages.cube().contents
+POINTS = CUBE.positions
 COUNT = LEAST_INSTANCES + 6
 
 
-def cube(scheme="catmull_clark", **more):
-    return CageContents(POINTS, np.full(6, 4), np.concatenate(FACES), scheme=scheme, **more)
+def cube_shape(name="/cube", to_world=None, **changes):
+    cage = replace(CUBE, **{"scheme": "catmull_clark", **changes})
+    return ShapeContents(name, cage, np.eye(4) if to_world is None else to_world)
 
 
 def placed(number):
@@ -191,43 +184,41 @@ def rates_of(shape):
     return {shape: np.where(np.arange(COUNT) < 10, 3, 1)}
 
 
-def joined(contents):
-    return with_copies(contents, {}, "exact", StageWarnings())[0].shapes
+def copied(contents, rates=None, shading="exact", notes=None, **more):
+    return with_copies(contents, rates or {}, shading, notes or StageWarnings(), **more)
 
 
 def test_copies_of_one_rate_are_one_shape():
-    shape, alone = ShapeContents("/cube", cube(), np.eye(4)), ShapeContents("/alone", cube(), np.eye(4))
-    contents, rates = with_copies(scene([alone], [shape]), rates_of(shape), "exact", StageWarnings())
+    shape, alone = cube_shape(), cube_shape("/alone")
+    contents, rates = copied(scene([alone], [shape]), rates_of(shape))
     first, many, few = contents.shapes
     assert (contents.groups, contents.instances, first) == ([], [], alone)
     assert (rates[many], rates[few], len(few.cage.face_sizes)) == (1, 3, 6 * 10)
     expected = [POINTS * [1, 2, 1] + [number, 0, 0] for number in range(10)]
     np.testing.assert_allclose(few.cage.positions, np.concatenate(expected))
     # Those of a part show its faces only.
-    (part,) = joined(scene(group=[replace(shape, shown_faces=np.array([1, 4]))]))
+    (part,) = copied(scene(group=[replace(shape, shown_faces=np.array([1, 4]))]))[0].shapes
     np.testing.assert_array_equal(part.shown_faces, np.add.outer(6 * np.arange(COUNT), [1, 4]).ravel())
 
 
 @pytest.mark.parametrize("shading", ["vertex", "exact"])
 def test_the_highest_rate_gives_way_to_memory(monkeypatch, shading):
     """Twice as many triangles along each side of 10 cubes do not fit."""
-    triangles = 12 * (10 * 2**2 + (COUNT - 10))
+    triangles, shape = 12 * (10 * 2**2 + (COUNT - 10)), cube_shape()
     fits = copies.TRIANGLE_BYTES * triangles + copies.FACE_BYTES[shading] * 6 * COUNT
-    shape = ShapeContents("/cube", cube(), np.eye(4))
     for allowed, expected in ((fits, [1, 2]), (fits - 1, [1])):
         monkeypatch.setattr(copies, "MOST_BYTES", allowed)
-        _, rates = with_copies(scene(group=[shape]), rates_of(shape), shading, StageWarnings())
-        assert [*rates.values()] == expected
+        assert [*copied(scene(group=[shape]), rates_of(shape), shading)[1].values()] == expected
     # Rates that are chosen do not give way.
-    assert with_copies(scene(group=[shape]), rates_of(shape), shading, StageWarnings(), lowest=3)[1] == {}
+    assert copied(scene(group=[shape]), rates_of(shape), shading, lowest=3)[1] == {}
 
 
 def test_what_is_too_few_or_too_much_stays_instances_and_much_is_told_with_numbers(monkeypatch):
-    shape, notes = ShapeContents("/cube", cube(), np.eye(4)), StageWarnings()
+    shape, notes = cube_shape(), StageWarnings()
     few, contents = (scene(group=[shape], count=count) for count in (LEAST_INSTANCES - 1, COUNT))
-    assert with_copies(few, {}, "exact", StageWarnings()) == (few, {})
+    assert copied(few) == (few, {})
     monkeypatch.setattr(copies, "MOST_BYTES", 1)
-    assert with_copies(contents, rates_of(shape), "exact", notes) == (contents, {})
+    assert copied(contents, rates_of(shape), notes=notes) == (contents, {})
     with pytest.warns(UserWarning, match=rf"copies with {6 * COUNT:,} faces .* GB, and stay {COUNT} instances"):
         notes.warn("stage")
 
@@ -236,18 +227,17 @@ def test_copies_that_are_no_instances_are_one_shape_too():
     """With attributes, which Mitsuba looks up in the wrong place of instances."""
     kinds = {"heat": (8, "vertex"), "paint": (24, "face_varying")}
     attributes = {name: Attribute(np.arange(1.0 * count)[:, None], kind) for name, (count, kind) in kinds.items()}
-    cage = cube(None, attributes=attributes)
-    mirrored = np.diag([-1.0, 1, 1, 1])
-    shapes = [ShapeContents(f"/c{k}", cage, mirrored @ placed(k) if k else placed(k)) for k in range(COUNT)]
-    (copied,) = joined(scene(shapes, count=0))
-    heat, paint = (copied.cage.attributes[name] for name in ("heat", "paint"))
+    shape, mirrored = cube_shape(scheme=None, attributes=attributes), np.diag([-1.0, 1, 1, 1])
+    shapes = [replace(shape, to_world=mirrored @ placed(k) if k else placed(k)) for k in range(COUNT)]
+    (joined,) = copied(scene(shapes, count=0))[0].shapes
+    heat, paint = (joined.cage.attributes[name] for name in ("heat", "paint"))
     np.testing.assert_array_equal(heat.values.ravel(), np.tile(np.arange(8.0), COUNT))
     # Faces of mirrored copies are turned over, with what their corners have.
-    corners = np.concatenate(FACES)
-    at_vertices = dict(zip(zip(np.arange(24) // 4, corners, strict=True), np.arange(24.0), strict=True))
-    vertices = copied.cage.face_vertices[24:48] - 8
+    faces, corners = np.arange(24) // 4, zip(np.arange(24) // 4, CUBE.face_vertices, strict=True)
+    at_vertices = dict(zip(corners, np.arange(24.0), strict=True))
+    vertices = joined.cage.face_vertices[24:48] - 8
     values = paint.values[paint.indices[24:48], 0]
-    assert [at_vertices[place] for place in zip(np.arange(24) // 4, vertices, strict=True)] == values.tolist()
+    assert [at_vertices[place] for place in zip(faces, vertices, strict=True)] == values.tolist()
 
 
 def strip(faces):
@@ -265,7 +255,7 @@ def test_large_copies_are_shapes_of_their_own_that_share_a_cage(monkeypatch):
     assert [copy.name for copy in separate.shapes[:2]] == ["/i0/strip", "/i1/strip"]
     assert all(copy.cage is shape.cage for copy in separate.shapes)
     np.testing.assert_array_equal([copy.to_world for copy in separate.shapes], [2 * placed(k) for k in range(COUNT)])
-    assert with_copies(separate, {}, "exact", StageWarnings()) == (separate, {})
+    assert copied(separate) == (separate, {})
     monkeypatch.setattr(copies, "MOST_BYTES", copies.TRIANGLE_BYTES * 2 * LARGE * COUNT - 1)
     assert with_large_copies(contents) is contents
     # Nor are small ones, or few.
