@@ -24,6 +24,8 @@ from mitsuba_subdivision.studio.cage_scenes import CageScenes, Model
 from mitsuba_subdivision.studio.picture import ERRORS
 from mitsuba_subdivision.studio.studio_entries import Look
 
+exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
+llvm, scalar = (pytest.mark.usefixtures(f"variant_{name}") for name in ("llvm_ad_rgb", "scalar_rgb"))
 SCENES = Path(msub.example_file("human.xml")).parent
 SMALL = ["--size", "20x15", "--spp", "4", "--rate", "2", "-m", "scalar_rgb"]
 SCENE = '<scene version="3.0.0"><integrator type="path"/>{}</scene>'
@@ -82,7 +84,7 @@ raise SystemExit(main([*words, "a.exr"]) or main([*words, "b.exr", "--passes", "
         np.testing.assert_allclose(pixels(name)[..., :3], 0.5, rtol=1e-3)
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 def test_a_turntable_comes_round():
     table = Turntable(CageScenes(named_cages.cube(), Look(size=(24, 18), spp=64, rate=4, view="front")), 4)
     np.testing.assert_allclose(table.matrix(5), table.matrix(1), atol=1e-12)
@@ -127,7 +129,7 @@ def moving_cages(folder):
         (moved.refined() if number == 3 else moved).save(folder / f"f_{number:02d}.obj")
 
 
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@llvm
 def test_frames_are_what_each_file_gives_alone(folder):
     moving_cages(folder)
     look = Look(size=(20, 15), spp=16, rate=2, up="z", cage=True)
@@ -146,7 +148,7 @@ def test_frames_are_what_each_file_gives_alone(folder):
             np.testing.assert_allclose(a, b, atol=2e-6)
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 def test_each_file_is_read_once(folder, monkeypatch):
     moving_cages(folder)
     read, evaluated = [], []
@@ -165,7 +167,7 @@ def test_each_file_is_read_once(folder, monkeypatch):
     assert len(evaluated) == 1
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 def test_times_of_a_usd_file_are_frames(folder):
     pytest.importorskip("pxr")
     cage = named_cages.cube()
@@ -185,7 +187,7 @@ def test_times_of_a_usd_file_are_frames(folder):
 EXACT = ["--size", "20x15", "--rate", "2", "--shading", "exact"]
 
 
-@pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
+@exact
 @pytest.mark.parametrize(
     "words",
     [
@@ -195,7 +197,7 @@ EXACT = ["--size", "20x15", "--rate", "2", "--shading", "exact"]
         ["scene.xml", "-o", "a.exr", "--passes", "2"],
     ],
 )
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@llvm
 def test_an_error_at_a_hit_ends_the_command(folder, capsys, monkeypatch, words):
     shape = """<shape type="subdivision"><string name="filename" value="cube.obj"/>
         <string name="shading" value="exact"/></shape>"""
@@ -210,25 +212,15 @@ def test_an_error_at_a_hit_ends_the_command(folder, capsys, monkeypatch, words):
     assert {path.name for path in folder.iterdir()} == {"cube.obj", "scene.xml"}
 
 
-exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
-llvm = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 CUBE = named_cages.cube()
 TINY = ["--size", "20x15", "--spp", "4"]
 # Of the error by as many samples, at most: measured 0.34.
 LEFT = 0.6
 
 
-@pytest.fixture
-def file(tmp_path, monkeypatch):
-    """Name of a file of the cube in the working folder."""
-    monkeypatch.chdir(tmp_path)
-    CUBE.save("cube.obj")
-    return "cube.obj"
-
-
 @exact
 @llvm
-def test_still_pictures_follow_the_sensor_and_others_do_not(capfd):
+def test_still_pictures_follow_the_sensor_and_others_do_not(folder, capfd):
     made = msub.studio_scene(CUBE)
     surface = made["surface"]
     assert surface["shading"] == "exact"
@@ -240,6 +232,11 @@ def test_still_pictures_follow_the_sensor_and_others_do_not(capfd):
         assert scene["surface"]["tessellation_rate"] == model.default_rate
     assert msub.studio_scene(CUBE, rate=3)["surface"]["tessellation_rate"] == 3
     assert capfd.readouterr() == ("", "")
+    # Scenes that are saved are to be edited.
+    assert render("cube.obj", "-o", "a.png", *TINY, "--save-scene", "a.xml", "-m", "llvm_ad_rgb") == 0
+    text = (folder / "a.xml").read_text()
+    assert "adaptive" not in text
+    assert '<string name="shading" value="exact"/>' in text
 
 
 @exact
@@ -261,7 +258,7 @@ def test_outlines_are_within_the_error():
     assert np.abs(covered(made) - expected).max() < 2**0.5 * ERRORS["exact"]
 
 
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 def test_scalar_variants_keep_normals_of_vertices_and_say_so_once(capfd):
     made = msub.studio_scene(CUBE)
     assert made["surface"]["tessellation_rate"] == Model(CUBE).default_rate
@@ -277,25 +274,16 @@ def test_scalar_variants_keep_normals_of_vertices_and_say_so_once(capfd):
 
 @pytest.mark.parametrize("words", [["--rate", "2"], ["--turntable", "2"]])
 @llvm
-def test_the_command_says_once_what_it_does_elsewhere(file, monkeypatch, capfd, words):
+@pytest.mark.usefixtures("folder")
+def test_the_command_says_once_what_it_does_elsewhere(monkeypatch, capfd, words):
     monkeypatch.setattr(interaction_hook, "hook_problem", lambda: "needs another computer")
-    assert main(["render", file, "-o", "a.png", *TINY, *words, "-m", "llvm_ad_rgb"]) == 0
+    assert render("cube.obj", "-o", "a.png", *TINY, *words, "-m", "llvm_ad_rgb") == 0
     assert capfd.readouterr().err.count("exact shading needs another computer\n") == 1
-    assert main(["render", file, "-o", "b.png", *TINY, *words, "--shading", "vertex", "-m", "llvm_ad_rgb"]) == 0
+    assert render("cube.obj", "-o", "b.png", *TINY, *words, "--shading", "vertex", "-m", "llvm_ad_rgb") == 0
     assert "exact shading" not in capfd.readouterr().err
 
 
-@exact
-@llvm
-def test_scenes_that_are_saved_do_not_follow_their_sensor(file, tmp_path):
-    """It is to be edited."""
-    assert main(["render", file, "-o", "a.png", *TINY, "--save-scene", "a.xml", "-m", "llvm_ad_rgb"]) == 0
-    text = (tmp_path / "a.xml").read_text()
-    assert "adaptive" not in text
-    assert '<string name="shading" value="exact"/>' in text
-
-
-@pytest.mark.usefixtures("variant_scalar_rgb")
+@scalar
 def test_denoising_removes_noise():
     pytest.importorskip("mitsuba_oidn")
     scene = msub.studio_scene(CUBE, size=(48, 36), rate=2)
@@ -307,15 +295,17 @@ def test_denoising_removes_noise():
     assert error < LEFT * before
 
 
-def test_denoised_pictures_are_no_references(file, capsys):
+@pytest.mark.usefixtures("folder")
+def test_denoised_pictures_are_no_references(capsys):
     pytest.importorskip("mitsuba_oidn")
-    assert main(["render", file, "-o", "a.exr", *TINY, "-m", "scalar_rgb", "--denoise"]) == 0
+    assert render("cube.obj", "-o", "a.exr", *TINY, "-m", "scalar_rgb", "--denoise") == 0
     assert load_image("a.exr").metadata["denoised"]
     assert main(["compare", "a.exr", "a.exr"]) == 3
     assert '"a.exr" is denoised, which removes what is compared; expected one as rendered' in capsys.readouterr().err
 
 
-def test_a_missing_denoiser_names_the_extra(file, capsys, monkeypatch):
+@pytest.mark.usefixtures("folder")
+def test_a_missing_denoiser_names_the_extra(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
-    assert main(["render", file, "-o", "a.png", "--denoise"]) == 1
+    assert render("cube.obj", "-o", "a.png", "--denoise") == 1
     assert 'pip install "mitsuba-subdivision[denoise]"' in capsys.readouterr().err
