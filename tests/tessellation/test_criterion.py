@@ -5,7 +5,7 @@ import warnings
 
 import numpy as np
 import pytest
-from kernels.surfaces import KINDS, surface_named
+from kernels.surfaces import surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.cage.named_cages import extraordinary
@@ -36,17 +36,15 @@ TORUS, SENSOR = LimitSurface(torus(8, 6)), Sensor(np.array([0.0, -8, 5]), 2e-3)
 BICUBIC = BernsteinBasis(SQUARE, 3)
 
 
-def distance(surface, table, most=300):
+def distance(surface, table, most=1000):
     """Largest distance of some points of triangles from the surface."""
-    positions, _ = table.apply(surface.cage.positions)
-    chosen = np.random.default_rng(1).permutation(len(table.triangles))[:most]
-    points = (WEIGHTS @ positions[table.triangles[chosen]]).reshape(-1, 3)
-    return surface.closest_point(points).distance.max()
+    corners = table.apply(surface.cage.positions)[0][np.random.default_rng(1).permutation(table.triangles)[:most]]
+    return surface.closest_point((WEIGHTS @ corners).reshape(-1, 3)).distance.max()
 
 
 # Surfaces with few elements, as every point is compared with all of them.
-CHECKED = [name for name in KINDS if name not in ("valence 50", "chaikin", "semi-sharp ring")]
-CHECKED += ["mixed torus", "valence 2", "holes", "dart", "crease", "into a dart", "rook"]
+CHECKED = ["torus", "smooth triangles", "half disc of 6", "non-manifold", "corner", "propeller", "into a dart", "holes"]
+CHECKED += ["valence 2", "loop mixed torus", "loop sheet", "loop corner", "doo_sabin mixed torus", "doo_sabin sheet"]
 
 
 @pytest.mark.parametrize("name", CHECKED)
@@ -77,8 +75,15 @@ def test_rates_stay_below_the_highest(name):
         assert tiles["depth"].max() > 15
 
 
-@OF_EACH_KIND
-@pytest.mark.parametrize("measure", Measure)
+@pytest.mark.parametrize(
+    ("name", "measure"),
+    [
+        ("cube", Measure.EDGE),
+        ("loop mixed torus", Measure.CHORD),
+        ("doo_sabin mixed torus", Measure.EDGE),
+        ("half disc of 6", Measure.CHORD),
+    ],
+)
 def test_a_warning_names_the_highest_rate_that_the_limit_needs(name, measure):
     """Or one nearer to it: how many segments patches need that are not divided is not known."""
     surface, rates = surface_named(name), [2]
@@ -135,7 +140,7 @@ def test_flat_surfaces_end_where_they_should(surface, error):
     # Of two sheets that are one, both are as near: searches take ten times as long.
     assert distance(surface, table, 30) <= most
     # Points of the surface near its borders, and the triangles' edges, which are triangles without area.
-    dense = surface.tessellate(64).positions
+    dense = surface.tessellate(24).positions
     outline = dense[ConvexHull(dense[:, [0, 2] if np.ptp(dense[:, 1]) == 0 else [0, 1]]).vertices]
     edges = np.unique(np.sort(directed_edges(table.triangles)), axis=0)
     assert distances_to(table.apply(surface.cage.positions)[0][edges[:, [0, 1, 1]]], outline).max() <= most
@@ -156,13 +161,13 @@ def test_an_isolated_point_of_high_rate_stays_isolated():
 
 def test_an_even_torus_has_no_more_triangles_than_the_uniform_grid():
     uniform = TORUS.sampling(16)
-    largest = distance(TORUS, uniform, 1500)
+    largest = distance(TORUS, uniform)
     table = TORUS.adaptive_sampling(Criterion(Measure.CHORD, largest), 64)
     assert len(table.triangles) <= 1.05 * len(uniform.triangles)
-    assert distance(TORUS, table, 1500) <= largest
+    assert distance(TORUS, table) <= largest
 
 
-@pytest.mark.parametrize("valence", [3, 5, 12])
+@pytest.mark.parametrize("valence", [3, 12])
 def test_rings_follow_a_close_look_at_an_extraordinary_vertex(valence):
     """Seen from near, triangles around the vertex have about the same size in pixels, not in parameters."""
     surface = LimitSurface(bumpy(extraordinary(valence)))
@@ -252,7 +257,7 @@ def test_only_outlines_are_fine_where_only_they_are_asked_for():
     assert (coarse[elements] > 0.2 * dense[elements]).all()
 
 
-@pytest.mark.parametrize("name", ["torus", "mixed torus", "loop mixed torus", "doo_sabin mixed torus"])
+@pytest.mark.parametrize("name", ["mixed torus", "loop mixed torus", "doo_sabin mixed torus"])
 def test_rates_follow_a_displacement(name):
     """Seen along the normals, triangles of the displaced surface are as near to it as asked."""
     surface, error = surface_named(name), 3e-3

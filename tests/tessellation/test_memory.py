@@ -164,7 +164,7 @@ def test_a_tessellation_is_shown_by_its_sizes():
 
 def test_the_coarsest_triangles_of_a_dense_cage_take_at_most_twice_the_memory_of_uniform_ones():
     """At the peak, from a cage to points, normals and triangles."""
-    cage = triangulated(torus(100, 80))
+    cage = triangulated(torus(60, 50))
 
     def measured(make):
         tracemalloc.start()
