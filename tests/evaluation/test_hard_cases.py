@@ -1,64 +1,17 @@
-"""Extraordinary points whose subdivision matrix is defective, and valence 2."""
+"""Samples far down, where powers of Jordan blocks grow, and around vertices of valence 2."""
 
 from itertools import pairwise
 
-import mpmath
 import numpy as np
 import pytest
-from evaluation.common import assert_exact, evaluate_from, patch_of
+from evaluation.common import assert_exact, evaluate_from
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
-from mitsuba_subdivision.evaluation.eigenbasis import eigenbasis
-from mitsuba_subdivision.evaluation.equations import times_powers
-from patches.closed_cages import cube_with_valence_2
-from reference.bars import DERIVATIVE, NORMAL, POINT
+from patches.closed_cages import cube_with_valence_2, polygons
+from reference.bars import NORMAL, POINT
 from reference.brute_force import BruteForce
-from reference.exact_samples import SCHEMES, angle, bumpy, faces_of, samples_at
+from reference.exact_samples import SCHEMES, angle, bumpy, samples_at
 
-# plugin/MATHEMATICS.md, section 6: scheme, valence, defective eigenvalue, its algebraic and its geometric multiplicity.
-DEFECTIVE = [
-    ("loop", 3, 1 / 16, 3, 2),
-    ("doo_sabin", 5, 1 / 4, 4, 2),
-    ("doo_sabin", 6, 1 / 4, 5, 3),
-    ("doo_sabin", 8, 1 / 4, 7, 5),
-]
-EVERY_DEFECTIVE = pytest.mark.parametrize("case", DEFECTIVE, ids=lambda case: f"{case[0]}-{case[1]}")
 DEEP = (60, 75, 90)
-# Below this, a singular value of a 60-digit matrix with entries rounded to float64 is zero; the next are above 1e-6.
-ZERO = 1e-12
-
-
-@EVERY_DEFECTIVE
-def test_the_matrix_is_defective_and_its_basis_keeps_a_block(case):
-    scheme, valence, eigenvalue, algebraic, geometric = case
-    matrix = patch_of(scheme, valence).matrix
-    shifted = matrix - eigenvalue * np.eye(len(matrix))
-    for power, expected in ((1, geometric), (2, algebraic), (3, algebraic)):
-        singular = np.linalg.svd(np.linalg.matrix_power(shifted, power), compute_uv=False)
-        assert (singular < ZERO).sum() == expected
-    basis = eigenbasis(matrix)
-    assert [len(block) for _, block in basis.blocks] == [algebraic]
-    (place, _), *_ = basis.blocks
-    np.testing.assert_allclose(basis.eigenvalues[place], eigenvalue, atol=1e-12)
-    assert np.linalg.cond(basis.vectors) < 100
-
-
-@EVERY_DEFECTIVE
-@pytest.mark.parametrize("level", [7, 45])
-def test_scaled_powers_of_a_defective_matrix_match_mpmath(case, level):
-    """``V (T / lambda_2)^n L`` without its first eigenvector is ``(A^n - 1 l) / lambda_2^n``, in 60 digits."""
-    scheme, valence, *_ = case
-    matrix = patch_of(scheme, valence).matrix
-    basis = eigenbasis(matrix)
-    with mpmath.workdps(60):
-        exact = mpmath.matrix(matrix.tolist())
-        # Rounded rows miss one by 1e-17, which powers would let grow.
-        for i in range(exact.rows):
-            exact[i, i] += 1 - mpmath.fsum(exact[i, j] for j in range(exact.cols))
-        limit = exact**512
-        scaled = (exact**level - limit) / mpmath.mpf(basis.subdominant) ** level
-        expected = np.array(scaled.tolist(), dtype=float)
-    powers = times_powers(basis.vectors[None], np.full(len(matrix), level), basis, basis.subdominant)[0] @ basis.inverse
-    assert np.abs(powers - expected).max() < DERIVATIVE
 
 
 @pytest.mark.parametrize(
@@ -72,20 +25,17 @@ def test_deep_samples_match_explicit_refinement(scheme, valence):
     assert_exact(samples, exact, curvature_levels=np.inf)
 
 
-def test_points_near_valence_2_match_explicit_refinement():
-    exact = samples_at("catmull_clark", 2)
-    samples = LimitSurface(exact.cage).evaluate(0, np.concatenate([exact.uv, [[0.0, 0.0]]]))
-    assert np.abs(samples.p - np.concatenate([exact.p, [exact.limit_p]])).max() <= POINT * exact.size
-    assert angle(samples.n[:-1], exact.n).max() <= NORMAL
-
-
-def test_normal_at_valence_2_is_that_of_the_subdominant_eigenvectors():
+def test_valence_2_matches_explicit_refinement_and_its_normal_is_that_of_the_subdominant_eigenvectors():
     """(13): edge neighbours and far corners contract by 1/4, whatever the rings beyond do."""
     exact = samples_at("catmull_clark", 2)
+    surface = LimitSurface(exact.cage)
+    samples = surface.evaluate(0, np.concatenate([exact.uv, [[0.0, 0.0]]]))
+    assert np.abs(samples.p - np.concatenate([exact.p, [exact.limit_p]])).max() <= POINT * exact.size
+    assert angle(samples.n[:-1], exact.n).max() <= NORMAL
     # Faces (0, a, b, c) and (0, c, d, a).
     a, b, c, d = exact.cage.positions[exact.cage.face_vertices[[1, 2, 3, 6]]]
-    samples = LimitSurface(exact.cage).evaluate([0, 1], [[0.0, 0.0]])
-    for normals in (samples.n, np.cross(samples.dp_du, samples.dp_dv)):
+    at_point = surface.evaluate([0, 1], [[0.0, 0.0]])
+    for normals in (at_point.n, np.cross(at_point.dp_du, at_point.dp_dv)):
         assert angle(normals, np.cross(a - c, b - d)).max() <= NORMAL
 
 
@@ -94,12 +44,11 @@ def test_valence_2_has_one_limit_from_both_sides():
     around = np.flatnonzero(cage.face_vertices == 8)
     assert len(around) == 2
     samples = evaluate_from(LimitSurface(cage), around, [[0.0, 0.0]])
-    assert np.abs(samples.p[0] - samples.p[1]).max() <= POINT
-    assert angle(samples.n[0], samples.n[1]) <= NORMAL
+    assert angle(*samples.n) <= NORMAL
     face = int(cage.topology.face[around[0]])
-    at_vertex = face, int(around[0] - cage.topology.face_offsets[face])
-    near = BruteForce("catmull_clark", cage.positions, faces_of(cage)).evaluate(*at_vertex, 2.0**-60, 0)
-    assert np.abs(samples.p[0] - np.array(near.p, dtype=float)).max() <= POINT
+    corner = int(around[0] - cage.topology.face_offsets[face])
+    near = BruteForce("catmull_clark", cage.positions, polygons(cage.topology)).evaluate(face, corner, 2.0**-60, 0)
+    assert np.abs(samples.p - near.p.astype(float)).max() <= POINT
 
 
 def test_loop_at_valence_2_is_what_refinement_comes_to():

@@ -87,13 +87,6 @@ def test_holes_shape_the_surface_but_are_not_part_of_it():
     assert_part(pierced, LimitSurface(cage).tessellate(3), set(range(9)) - {0, 4})
 
 
-def test_holes_are_no_elements():
-    surface = LimitSurface(sheet(3, 3, holes=[4]))
-    surface.evaluate(3, [[0.5, 0.5]])
-    with pytest.raises(ValueError, match="element of sample 0 is 4; expected one that has a surface: no hole"):
-        surface.evaluate(4, [[0.5, 0.5]])
-
-
 def test_boundary_none_leaves_the_faces_that_do_not_touch_it():
     cage = bumpy(sheet(4, 4))
     inner = LimitSurface(tagged(cage, boundary="none")).tessellate(2)

@@ -36,6 +36,9 @@ def test_corners_name_the_same_point():
     assert np.abs(same.dp_dv[0] - same.dp_du[1]).max() < 1e-13
 
 
+NO_POINTS = ([1.0, 2.0, 3.0], [[1.0, 2.0]], [[0.0, np.nan, 0.0]], [[np.inf, 0.0, 0.0]])
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -57,6 +60,12 @@ def test_corners_name_the_same_point():
         (lambda s: s.evaluate(0, [[0, 0]], dtype=np.float16), "dtype float16: expected float32 or float64"),
         (lambda s: s.evaluate(0, [[0, 0]], dtype="foo"), "dtype foo: expected float32 or float64"),
         (lambda s: s.evaluate(0, [[0, 0]], derivatives=3), "derivatives 3; expected 1 or 2"),
+        *((lambda s, count=count: s.sample(count), "expected an integer of 0 or more") for count in (-1, 2.5, "3")),
+        *((lambda s, p=p: s.closest_point(p), r"expected \(s, 3\), all of them finite") for p in NO_POINTS),
+        (lambda s: s.bounds([6]), "element of sample 0 is 6; expected 0 to 5"),
+        (lambda s: s.bounds([-1]), "element of sample 0 is -1; expected 0"),
+        (lambda s: s.bounds([0.5]), "expected integers"),
+        *((lambda s, n=n: s.stiffness(n), "order .*; expected an integer of 1 or more") for n in (0, 1.5, "4")),
         (lambda s: s.tessellate(2, dtype="foo"), "dtype foo: expected float32 or float64"),
         (lambda s: s.tessellate(2, evaluator="foo"), 'unknown evaluator "foo"; expected one of power, stam'),
         (lambda s: s.tessellate(2, evaluator="stam"), 'evaluator "stam" has no value at extraordinary points'),

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from kernels.surfaces import surface_named
 from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.patches.area_samples import uniform_locations
-from reference.refined_cages import sheet, tagged
+from reference.refined_cages import sheet
 from scipy.special import chdtrc, kolmogorov
 
 NAMES = ["mixed torus", "half disc of 6", "crease", "loop mixed torus", "loop corner", "doo_sabin mixed torus"]
@@ -97,41 +96,12 @@ def test_seeds_determine_points():
     assert (surface.sample(100, rng).p != first.p).any(axis=1).all()
 
 
-def test_samples_do_not_depend_on_the_unit_of_length():
-    cage = cube()
-    metres, millimetres = (LimitSurface(cage.with_positions(unit * cage.positions)) for unit in (1, 1024))
-    first, second = metres.sample(100, 3), millimetres.sample(100, 3)
-    np.testing.assert_array_equal(first.uv, second.uv)
-    cells, scaled = metres._sampling_cells(), millimetres._sampling_cells()
-    np.testing.assert_array_equal(cells.offsets, scaled.offsets)
-    np.testing.assert_allclose(1024**2 * cells.areas, scaled.areas, rtol=1e-12)
-
-
 def test_points_are_those_of_their_parameters():
     surface = surface_named("rook")
     samples = surface.sample(1000)
     expected = surface.evaluate(samples.element, samples.uv, samples.corner)
     for column in ("p", "n", "dp_du", "dp_dv"):
         np.testing.assert_array_equal(getattr(samples, column), getattr(expected, column))
-
-
-def test_holes_have_no_points():
-    assert 1 not in LimitSurface(tagged(cube(), holes=[1])).sample(1000).element
-
-
-@pytest.mark.parametrize("count", [-1, 2.5, "3"])
-def test_counts_that_are_none_are_an_error(count):
-    with pytest.raises(ValueError, match="expected an integer of 0 or more"):
-        LimitSurface(cube()).sample(count)
-
-
-def test_a_surface_without_area_has_no_points_but_none_can_be_drawn_of_any():
-    assert LimitSurface(cube()).sample(0).p.shape == (0, 3)
-    surface = LimitSurface(cube().with_positions(np.zeros((8, 3))))
-    with pytest.raises(ValueError, match="the surface has no area"):
-        surface.sample(3)
-    with pytest.raises(ValueError, match="the surface has no area"):
-        surface.on_device("llvm_ad_rgb").sample(0.5, [0.5, 0.5])
 
 
 def test_points_of_a_flat_sheet_are_uniform_however_its_parameters_run():

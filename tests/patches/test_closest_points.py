@@ -12,7 +12,7 @@ from mitsuba_subdivision.patches import closest_points
 from mitsuba_subdivision.patches.closest_points import BoxTree
 from mitsuba_subdivision.patches.nearest_in_piece import TurnedBoxes, nearest_in_pieces
 from patches.closed_cages import bumpy, cage_of, creased
-from reference.refined_cages import refine_first, sheet, tagged
+from reference.refined_cages import sheet
 from scipy.spatial import cKDTree
 
 # Points of each kind: all around, near the surface, on it, and far away.
@@ -144,18 +144,6 @@ def test_creases_are_found(np_rng):
     np.testing.assert_allclose(nearest.p, np.clip(points, -1, 1), rtol=0, atol=1e-13)
 
 
-def test_the_cage_refined_once_has_the_same_nearest_points(np_rng, monkeypatch):
-    surface = surface_named("mixed torus")
-    points = np_rng.normal(size=(200, 3)) * 3
-    expected = surface.closest_point(points)
-    refine_first(monkeypatch)
-    refined = LimitSurface(surface.cage)
-    assert refined.patches.refined is not None
-    nearest = refined.closest_point(points)
-    np.testing.assert_allclose(nearest.distance, expected.distance, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(nearest.p, expected.p, rtol=0, atol=1e-7)
-
-
 @pytest.mark.parametrize("name", ["mixed torus", "semi-sharp ring", "loop mixed torus"])
 @pytest.mark.parametrize("constant", ["MOST_KEPT", "MOST_HALVED"])
 def test_levels_that_are_computed_when_needed_change_nothing(name, constant, np_rng, monkeypatch):
@@ -214,25 +202,8 @@ def test_descents_end_at_local_minima_and_depend_on_neither_the_unit_nor_other_p
     np.testing.assert_allclose(slope, np.concatenate([slopes for _, _, slopes in parts]), rtol=0, atol=DESCENT)
 
 
-def test_holes_have_no_nearest_points():
-    surface = LimitSurface(tagged(cube(), holes=[1]))
-    assert 1 not in surface.closest_point(np.random.default_rng(0).normal(size=(100, 3)) * 3).element
-
-
-@pytest.mark.parametrize("points", [[1.0, 2.0, 3.0], [[1.0, 2.0]], [[0.0, np.nan, 0.0]], [[np.inf, 0.0, 0.0]]])
-def test_points_that_are_none_are_an_error(points):
-    with pytest.raises(ValueError, match=r"expected \(s, 3\), all of them finite"):
-        LimitSurface(cube()).closest_point(points)
-
-
 def test_no_points_have_no_nearest_ones():
     assert LimitSurface(cube()).closest_point(np.empty((0, 3))).p.shape == (0, 3)
-
-
-def test_a_collapsed_surface_is_a_point():
-    nearest = LimitSurface(cube().with_positions(np.ones((8, 3)))).closest_point([[1.0, 1.0, 4.0]])
-    np.testing.assert_allclose(nearest.p, [[1, 1, 1]], rtol=0, atol=1e-14)
-    np.testing.assert_array_equal(nearest.n, [[0, 0, 0]])
 
 
 @pytest.mark.parametrize("name", ["rook", "semi-sharp ring", "loop mixed torus"])

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from kernels.surfaces import KINDS, SURFACES, grid_locations, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage.named_cages import cube
 from patches.closed_cages import bumpy, cage_of
-from reference.refined_cages import refine_first, sheet, tagged
+from reference.refined_cages import sheet
 
 SAMPLES = 5000
 MANY_SAMPLES = ("mixed torus", "loop mixed torus", "doo_sabin mixed torus")
@@ -85,39 +84,8 @@ def test_boxes_of_flat_elements_are_the_elements():
     np.testing.assert_allclose([inner.lower, inner.upper], [[[1, 1, 0]], [[2, 2, 0]]], rtol=0, atol=1e-5)
 
 
-def test_boxes_are_the_same_from_the_cage_refined_once(np_rng, monkeypatch):
-    cage = bumpy(cage_of("catmull_clark", "mixed torus"))
-    refine_first(monkeypatch)
-    refined = LimitSurface(cage)
-    assert refined.patches.refined is not None
-    assert_contained(refined, np_rng)
-    monkeypatch.undo()
-    boxes, expected = ([bounds.lower, bounds.upper] for bounds in (refined.bounds(), LimitSurface(cage).bounds()))
-    size = np.linalg.norm(expected[1] - expected[0], axis=1).max()
-    # Parts around extraordinary points are bounded otherwise.
-    np.testing.assert_allclose(boxes, expected, rtol=0, atol=0.03 * size)
-
-
 def test_elements_are_chosen_by_number():
     surface = LimitSurface(bumpy(cage_of("catmull_clark", "mixed torus")))
     every, some, chosen = surface.bounds(), surface.bounds([4, 1, 4]), [4, 1, 4]
     assert some.element.tolist() == chosen
     np.testing.assert_array_equal([some.lower, some.upper], [every.lower[chosen], every.upper[chosen]])
-
-
-def test_holes_have_no_box():
-    surface = LimitSurface(tagged(cube(), holes=[2]))
-    assert surface.bounds().element.tolist() == [0, 1, 3, 4, 5]
-    with pytest.raises(ValueError, match="element of sample 0 is 2; expected one that has a surface"):
-        surface.bounds([2])
-
-
-@pytest.mark.parametrize(("element", "problem"), [([6], "expected 0 to 5"), ([-1], "expected 0"), ([0.5], "integers")])
-def test_elements_that_do_not_exist_are_an_error(element, problem):
-    with pytest.raises(ValueError, match=problem):
-        LimitSurface(cube()).bounds(element)
-
-
-def test_a_collapsed_surface_has_boxes():
-    bounds = LimitSurface(cube().with_positions(np.zeros((8, 3)))).bounds()
-    np.testing.assert_array_equal([bounds.lower, bounds.upper], 0)

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import named_cages
 from patches.closed_cages import bumpy, cage_of, mixed_torus, torus
 from peers.fidelity_cages import SURFACES
-from reference.refined_cages import refine_first, sheet
+from reference.refined_cages import sheet
 
 # Of sums of entries of about one, and of eigenvalues, beside the largest entry.
 ROUNDING = 1e-12
@@ -101,35 +101,8 @@ def test_affine_functions_do_not_bend_in_the_plane(scheme, np_rng):
     assert np.abs(surface.stiffness() @ positions).max() > 0.1
 
 
-def test_size_changes_bending_only():
-    surface = SURFACES_OF_ALL_KINDS["polygons"]()
-    larger = moved(surface, 3 * surface.cage.positions)
-    np.testing.assert_allclose(larger.stiffness().data, surface.stiffness().data, rtol=1e-9, atol=ROUNDING)
-    np.testing.assert_allclose(9 * larger.bending().data, surface.bending().data, rtol=1e-9, atol=ROUNDING)
-
-
-def test_cages_that_are_refined_first_have_the_same_energies(monkeypatch):
-    plain = SURFACES_OF_ALL_KINDS["polygons"]()
-    expected = plain.stiffness(ORDER)
-    refine_first(monkeypatch)
-    surface = LimitSurface(plain.cage)
-    assert surface.patches.refined is not None
-    assert np.abs(surface.stiffness(ORDER) - expected).max() <= QUADRATURE * np.abs(expected).max()
-
-
 @pytest.mark.parametrize("name", ["sheet without corners", "piece, rings and rims"])
 def test_bending_is_finite_where_that_of_the_surface_is_not(name):
     # Smooth borders with one face at a vertex: curvature grows too fast there to be integrated.
     surface = LimitSurface(SURFACES[name])
     assert np.abs(surface.bending() - surface.bending(ORDER)).max() <= 0.05 * np.abs(surface.bending()).max()
-
-
-def test_collapsed_parts_have_no_energy():
-    surface = LimitSurface(ControlCage(np.zeros((4, 3)), [[0, 1, 2, 3]]))
-    assert surface.stiffness().count_nonzero() == surface.bending().count_nonzero() == 0
-
-
-@pytest.mark.parametrize("order", [0, 1.5, "4"])
-def test_an_order_that_is_none_is_an_error(order):
-    with pytest.raises(ValueError, match=r"order .*; expected an integer of 1 or more"):
-        LimitSurface(named_cages.cube()).stiffness(order)
