@@ -7,7 +7,7 @@ stage_walk.py, stage_*.py    read a stage to plain data; stage_warnings.py gives
 materialx_layers.py          the USD layers and the node library of MaterialX
 contents.py                  the plain data
 surface_models.py            models of surfaces, by the inputs that all share
-materialx_nodes.py, materialx_noise.py   nodes of MaterialX, evaluated to numbers or pictures
+materialx_nodes.py           nodes of MaterialX, evaluated to numbers or pictures
 copies.py                    replaces many instances by meshes
 picture_detail.py            triangles and pixels of textures that a picture needs
 bsdfs.py, textures.py, texture_image.py, emitters.py, sensors.py   build scene entries from the data

@@ -39,10 +39,7 @@ MISSING = (
 
 
 def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
-    """The stage, or if it refers to MaterialX documents, one of copies of its layers that has them.
-
-    Warns about each document that cannot be read; messages begin with the name.
-    """
+    """The stage, or if it refers to MaterialX documents, one of copies of its layers that has them."""
     if Sdf.FileFormat.FindByExtension(_EXTENSION[1:]) is not None or not has_materialx():
         return stage
     identifiers: dict[str, str] = {}

@@ -2,7 +2,7 @@
 
 Values are arrays ``(..., k)`` with the channels of a type last. What a category computes is what the library of
 MaterialX 1.39 says in its shaders (``libraries/stdlib/genglsl``); categories that the library builds of others are not
-here.
+here. Noises, of points ``(..., 2)``, are those of Open Shading Language (``oslnoise.h``).
 """
 
 from __future__ import annotations
@@ -17,16 +17,19 @@ import numpy as np
 from mitsuba_subdivision.cage import same
 from numpy.typing import NDArray
 
-from . import materialx_noise as noise
 from .contents import Input, NodeContents, PrimvarContents, TextureContents
 
 Values = NDArray[np.floating]
+Hash = NDArray[np.uint32]
 CHANNELS = {
     "boolean": 1, "integer": 1, "float": 1, "vector2": 2, "vector3": 3, "color3": 3, "vector4": 4, "color4": 4,
 }  # fmt: skip
 # Luminance of linear Rec. 709.
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-
+# Makes Perlin noise be from -1 to 1 about.
+_PERLIN_SCALE = 0.6616
+# Where the last components of noises are taken from, of single ones and of sums.
+_ELSEWHERE, _ELSEWHERE_IN_SUMS = np.array([19.0, 73.0]), np.array([19.0, 193.0])
 
 # Values (..., k) of a picture at texture coordinates (..., 2), or for None at the points of an evaluation.
 Texels = Callable[[TextureContents, Values | None], Values]
@@ -183,39 +186,109 @@ def _roughness(n: SimpleNamespace) -> Values:
     return _stacked((np.minimum(squared / aspect, 1), squared * aspect))
 
 
-def _fractal(n: SimpleNamespace) -> Values:
-    octaves = int(np.ravel(n.octaves)[0])
-    return n.amplitude * noise.fractal(n.texcoord, octaves, n.lacunarity, n.diminish, n.width)
+def _perlin(points: Values, width: int) -> Values:
+    """Gradient noise, of 1 to 4 components."""
+    if width == 2:
+        return _perlin(points, 3)[..., :2]
+    if width == 4:
+        return _stacked((_perlin(points, 3), _perlin(points + _ELSEWHERE, 1)))
+    cell = np.floor(points)
+    x, y = np.moveaxis(points - cell, -1, 0)
+    u, v = (t**3 * (t * (t * 6 - 15) + 10) for t in (x, y))
+    column, row = np.moveaxis(cell.astype(np.int64), -1, 0)
+    components = []
+    for bits in 8 * np.arange(width, dtype=np.uint32):
+        corner = [_slope(_hashed(column + i, row + j) >> bits, x - i, y - j) for j in (0, 1) for i in (0, 1)]
+        components.append((1 - v) * (corner[0] * (1 - u) + corner[1] * u) + v * (corner[2] * (1 - u) + corner[3] * u))
+    return _PERLIN_SCALE * np.stack(components, axis=-1)
 
 
+def _fractal(points: Values, n: SimpleNamespace, width: int) -> Values:
+    """Sum of Perlin noises, each finer and weaker than the one before."""
+    if width in (2, 4):
+        return _stacked((_fractal(points, n, width - 1), _fractal(points + _ELSEWHERE_IN_SUMS, n, 1)))
+    total = np.zeros((*points.shape[:-1], width))
+    for octave in range(int(np.ravel(n.octaves)[0])):
+        total = total + n.diminish**octave * _perlin(points * n.lacunarity**octave, width)
+    return total
+
+
+def _cells(points: Values) -> Values:
+    """A random number from 0 to 1 for each unit square."""
+    return _random_numbers(*np.moveaxis(np.floor(points).astype(np.int64), -1, 0))[..., None]
+
+
+def _worley(n: SimpleNamespace) -> Values:
+    """Distance to the nearest of random points, one in each unit square; with style 1, a random number of that one."""
+    cell = np.floor(n.texcoord)
+    within = n.texcoord - cell
+    column, row = np.moveaxis(cell.astype(np.int64), -1, 0)
+    least, nearest = np.full(within.shape[:-1], np.inf), np.zeros(within.shape)
+    for i in (-1, 0, 1):
+        for j in (-1, 0, 1):
+            random = np.stack([_random_numbers(column + i, row + j, k) for k in (0, 1)], axis=-1)
+            offset = (random - 0.5) * n.jitter + 0.5 + (i, j) - within
+            distance = np.sum(offset**2, axis=-1)
+            nearest = np.where((distance < least)[..., None], offset, nearest)
+            least = np.minimum(distance, least)
+    style = int(np.ravel(getattr(n, "style", 0))[0])
+    return _cells(nearest + n.texcoord) if style == 1 else np.sqrt(least)[..., None]
+
+
+def _slope(hashed: Hash, x: Values, y: Values) -> Values:
+    """Product of an offset and one of 8 directions."""
+    direction = hashed & 7
+    u = np.where(direction < 4, x, y)
+    v = 2 * np.where(direction < 4, y, x)
+    return np.where(direction & 1, -u, u) + np.where(direction & 2, -v, v)
+
+
+def _random_numbers(*integers: NDArray[np.int64] | int) -> Values:
+    return _hashed(*integers) / float(0xFFFFFFFF)
+
+
+def _hashed(*integers: NDArray[np.int64] | int) -> Hash:
+    """Bob Jenkins' final mix of two or three integers."""
+    start = np.uint32((0xDEADBEEF + (len(integers) << 2) + 13) & 0xFFFFFFFF)
+    words = (np.asarray(np.asarray(integer, np.int64) & 0xFFFFFFFF).astype(np.uint32) for integer in (*integers, 0)[:3])
+    a, b, c = np.broadcast_arrays(*(word + start for word in words))
+
+    def turned(values: Hash, bits: int) -> Hash:
+        return (values << np.uint32(bits)) | (values >> np.uint32(32 - bits))
+
+    c = (c ^ b) - turned(b, 14)
+    a = (a ^ c) - turned(c, 11)
+    b = (b ^ a) - turned(a, 25)
+    c = (c ^ b) - turned(b, 16)
+    a = (a ^ c) - turned(c, 4)
+    b = (b ^ a) - turned(a, 14)
+    return (c ^ b) - turned(b, 24)
+
+
+def _applied(of: Callable[..., Values], *names: str) -> Callable[[SimpleNamespace], Values]:
+    return lambda n: of(*(getattr(n, name) for name in names))
+
+
+# Functions of NumPy, of one value and of two.
+_OF_ONE = {
+    "absval": np.abs, "floor": np.floor, "ceil": np.ceil, "sin": np.sin, "cos": np.cos, "tan": np.tan,
+    "asin": np.arcsin, "acos": np.arccos, "sqrt": np.sqrt, "ln": np.log, "exp": np.exp, "sign": np.sign,
+}  # fmt: skip
+_OF_TWO = {
+    "add": np.add, "subtract": np.subtract, "multiply": np.multiply, "divide": np.divide, "power": np.power,
+    "min": np.minimum, "max": np.maximum,
+}  # fmt: skip
 OPERATIONS: dict[str, Callable[[SimpleNamespace], Values]] = {
     "constant": lambda n: n.value,
     "dot": lambda n: n.in_,
-    "add": lambda n: n.in1 + n.in2,
-    "subtract": lambda n: n.in1 - n.in2,
-    "multiply": lambda n: n.in1 * n.in2,
-    "divide": lambda n: n.in1 / n.in2,
+    **{name: _applied(of, "in_") for name, of in _OF_ONE.items()},
+    **{name: _applied(of, "in1", "in2") for name, of in _OF_TWO.items()},
     "modulo": lambda n: n.in1 - n.in2 * np.floor(n.in1 / n.in2),
     "fract": lambda n: n.in_ - np.floor(n.in_),
     "invert": lambda n: n.amount - n.in_,
-    "absval": lambda n: np.abs(n.in_),
-    "floor": lambda n: np.floor(n.in_),
-    "ceil": lambda n: np.ceil(n.in_),
     "round": lambda n: np.floor(n.in_ + 0.5),
-    "power": lambda n: np.power(n.in1, n.in2),
-    "sin": lambda n: np.sin(n.in_),
-    "cos": lambda n: np.cos(n.in_),
-    "tan": lambda n: np.tan(n.in_),
-    "asin": lambda n: np.arcsin(n.in_),
-    "acos": lambda n: np.arccos(n.in_),
     "atan2": lambda n: np.arctan2(n.iny, n.inx),
-    "sqrt": lambda n: np.sqrt(n.in_),
-    "ln": lambda n: np.log(n.in_),
-    "exp": lambda n: np.exp(n.in_),
-    "sign": lambda n: np.sign(n.in_),
     "clamp": lambda n: np.minimum(np.maximum(n.in_, n.low), n.high),
-    "min": lambda n: np.minimum(n.in1, n.in2),
-    "max": lambda n: np.maximum(n.in1, n.in2),
     "and": lambda n: 1.0 * np.logical_and(n.in1, n.in2),
     "or": lambda n: 1.0 * np.logical_or(n.in1, n.in2),
     "not": lambda n: 1.0 * np.logical_not(n.in_),
@@ -257,10 +330,10 @@ OPERATIONS: dict[str, Callable[[SimpleNamespace], Values]] = {
     "ramptb": lambda n: _mixed(n.valueb, n.valuet, np.clip(n.texcoord[..., 1:2], 0, 1)),
     "splitlr": lambda n: np.where(n.texcoord[..., :1] >= n.center, n.valuer, n.valuel),
     "splittb": lambda n: np.where(n.texcoord[..., 1:2] >= n.center, n.valuet, n.valueb),
-    "noise2d": lambda n: n.amplitude * noise.perlin(n.texcoord, n.width) + n.pivot,
-    "fractal2d": _fractal,
-    "cellnoise2d": lambda n: noise.cells(n.texcoord),
-    "worleynoise2d": lambda n: noise.worley(n.texcoord, n.jitter, int(np.ravel(getattr(n, "style", 0))[0])),
+    "noise2d": lambda n: n.amplitude * _perlin(n.texcoord, n.width) + n.pivot,
+    "fractal2d": lambda n: n.amplitude * _fractal(n.texcoord, n, n.width),
+    "cellnoise2d": lambda n: _cells(n.texcoord),
+    "worleynoise2d": _worley,
     "roughness_anisotropy": _roughness,
 }
 # That read texture coordinates or pictures themselves.
@@ -295,10 +368,7 @@ def is_constant(given: Input) -> bool:
 
 
 def constant(given: Input, width: int | None = None) -> NDArray[np.float64]:
-    """Numbers ``(k,)`` of a constant input, maybe repeated to a width.
-
-    Raises TypeError if it is no number and no colour. Raises ValueError if it has another width.
-    """
+    """Numbers ``(k,)`` of a constant input, maybe repeated to a width. Raises TypeError, ValueError for others."""
     if not isinstance(given, (int, float, list)):
         raise TypeError(f"{given!r} is no number; expected one, or a colour")
     numbers = np.atleast_1d(np.asarray(given, dtype=np.float64))

@@ -67,10 +67,7 @@ def scene_entries(
     # Whether shapes of lights let light through, which takes the integrator `volpath`
     has_clear_lamps: bool = False,
 ) -> SceneNode:
-    """Scene entries of a stage, without those of a studio.
-
-    Limit surfaces are entries of the shape ``subdivision``, polygon meshes those of `PolygonMesh`.
-    """
+    """Scene entries of a stage, without those of a studio; polygon meshes are those of `PolygonMesh`."""
     scene: SceneNode = {"type": "scene"}
     # Keys of BSDFs that are the same for all shapes, by material.
     shared: dict[int, str] = {}
@@ -182,10 +179,7 @@ class Surfaces:
         self._of_shape: dict[tuple[str, int | None], CachedSurface] = {}
 
     def of(self, contents: CageContents) -> CachedSurface:
-        """The surface of a cage, without warnings.
-
-        Raises CageError if the cage is invalid. Raises SchemeError if the scheme cannot subdivide it.
-        """
+        """The surface of a cage, without warnings. Raises CageError, or SchemeError if the scheme is the reason."""
         key = len(contents.positions), len(contents.face_sizes), zlib.crc32(contents.positions.tobytes())
         alike = self._known.setdefault(key, [])
         for known in alike:
@@ -327,11 +321,7 @@ class LoadedShapes:
         entry: Callable[[SceneNode], SceneNode],  # Makes the entry of the shape with a BSDF
         bsdf: Callable[[], SceneNode],  # Makes the entry of its BSDF
     ) -> mi.Object:
-        """The object of a shape.
-
-        Raises CageError if the cage is invalid, or its points are not finite. Raises SchemeError if the scheme cannot
-        subdivide it.
-        """
+        """The object of a shape; errors are those of `subdivision`."""
         # Several shapes have one name if a mesh has several materials, or if groups have equal shapes.
         self._counts[shape.name] += 1
         key = shape.name, self._counts[shape.name]

@@ -60,10 +60,7 @@ def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Stage
 
 
 def _film_window(camera: CameraContents, aspect_ratio: float) -> tuple[float, float]:
-    """Width and height of the film of a camera, in its units, as its ``conform_policy`` fits the aperture to a picture.
-
-    By default, more is seen where the picture is wider or higher than the aperture.
-    """
+    """Width and height of a camera's film, in its units, as its ``conform_policy`` fits the aperture to a picture."""
     wide, of_height = camera.aperture[0], camera.aperture[1] * aspect_ratio
     wide = {
         "expandAperture": max(wide, of_height),

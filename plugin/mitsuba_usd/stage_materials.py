@@ -69,14 +69,25 @@ _MOST_NODES = 10_000
 _TRIED = np.array([[0, 0], [1, 0], [0, 1], [0.37, 0.61], [-2.3, 5.7], [17.1, -3.9], [-8.4, -11.2]])
 
 
+def _path_of(asset: Any, attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
+    """Path of the file that is the value of an attribute; "" for none."""
+    if asset.resolvedPath or UDIM not in asset.path:
+        return str(asset.resolvedPath or asset.path)
+    # No file has this name, so USD leaves it as it is. It is relative to the layer that says so.
+    layer = attribute.GetPropertyStack(time)[0].layer
+    return UsdShade.UdimUtils.ResolveUdimPath(asset.path, layer) or asset.path
+
+
 class MaterialReader:
-    """Reads materials, each once."""
+    """Reads materials, each once, by networks of shaders of USD and of those that are definitions of MaterialX."""
 
     def __init__(self, time: Usd.TimeCode, notes: StageWarnings) -> None:
-        self._notes = notes
-        self._networks = _NetworkReader(time, notes)
+        self._time, self._notes = time, notes
         self._numbers: dict[str, int | None] = {}
         self.materials: list[MaterialContents] = []  # Of those that are equal, the first
+        # Outputs of shaders, by path and name, and numbers of nodes by the identity of the expression.
+        self._known: dict[tuple[str, str], Input | None] = {}
+        self._sizes: dict[int, int] = {}
 
     def bound(self, prim: Usd.Prim) -> int | None:
         """Number of the material bound to a prim; None if there is none or it is not supported."""
@@ -97,17 +108,16 @@ class MaterialReader:
                 what = "materials whose inputs have other types than their model's are ignored"
                 self._notes.add(f"{what}, and display colours are used", path)
                 contents = None
-            self._numbers[path] = None
-            if contents is not None:
-                known = (n for n, other in enumerate(self.materials) if same(other, contents, frozenset({"name"})))
-                self._numbers[path] = next(known, len(self.materials))
-                self.materials += [contents] if self._numbers[path] == len(self.materials) else []
+            alike = (n for n, other in enumerate(self.materials) if same(other, contents, frozenset({"name"})))
+            self._numbers[path] = None if contents is None else next(alike, len(self.materials))
+            if contents is not None and self._numbers[path] == len(self.materials):
+                self.materials.append(contents)
         return self._numbers[path]
 
     def _contents(self, material: UsdShade.Material) -> MaterialContents | None:
         path = material.GetPath()
         surfaces = [surface for context in ("mtlx", "") if (surface := material.ComputeSurfaceSource(context)[0])]
-        read = next((inputs for inputs in map(self._networks.surface, surfaces) if inputs is not None), None)
+        read = next((inputs for inputs in map(self._surface, surfaces) if inputs is not None), None)
         if read is None:
             kinds = ", ".join(f'"{surface.GetShaderId() or "of files"}"' for surface in surfaces)
             what = f"surface shaders {kinds}" if surfaces else "materials without a surface shader"
@@ -123,38 +133,7 @@ class MaterialReader:
             self._notes.add("subsurface scattering is rendered as diffuse reflection of its colour", path)
         return surface_models.material(str(path), model, inputs)
 
-
-def _source_of(given: UsdShade.Input, notes: StageWarnings) -> Usd.Attribute | None:
-    """The attribute that has the value of an input, or the output that computes it; None if there is none."""
-    attributes = given.GetValueProducingAttributes() if given else []
-    if attributes:
-        return attributes[0]
-    attribute = given.GetAttr() if given else None
-    if attribute:
-        stage = attribute.GetStage()
-        if not all(stage.GetPropertyAtPath(path) for path in attribute.GetConnections()):
-            notes.add("connections of inputs to what is not there are ignored", attribute.GetPath())
-    return None
-
-
-def _path_of(asset: Any, attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
-    """Path of the file that is the value of an attribute; "" for none."""
-    if asset.resolvedPath or UDIM not in asset.path:
-        return str(asset.resolvedPath or asset.path)
-    # No file has this name, so USD leaves it as it is. It is relative to the layer that says so.
-    layer = attribute.GetPropertyStack(time)[0].layer
-    return UsdShade.UdimUtils.ResolveUdimPath(asset.path, layer) or asset.path
-
-
-class _NetworkReader:
-    """Reads shaders of USD, and those whose identifiers are definitions of MaterialX."""
-
-    def __init__(self, time: Usd.TimeCode, notes: StageWarnings) -> None:
-        self._time, self._notes = time, notes
-        self._known: dict[tuple[str, str], Input | None] = {}
-        self._sizes: dict[int, int] = {}
-
-    def surface(self, shader: UsdShade.Shader) -> tuple[str, dict[str, Input]] | None:
+    def _surface(self, shader: UsdShade.Shader) -> tuple[str, dict[str, Input]] | None:
         """Model of a surface, and its inputs but the vectors of the surface itself; None if it is of no known model."""
         name = shader.GetShaderId() or ""
         if name == _PREVIEW_SURFACE:
@@ -182,8 +161,13 @@ class _NetworkReader:
 
     def _input(self, shader: UsdShade.Shader, port: _Port) -> Input | None:
         """An input of a shader; None for a vector of the surface."""
-        attribute = _source_of(shader.GetInput(port.name), self._notes)
+        given = shader.GetInput(port.name)
+        attribute = next(iter(given.GetValueProducingAttributes() if given else ()), None)
         if attribute is None:
+            stage = shader.GetPrim().GetStage()
+            if given and not all(stage.GetPropertyAtPath(path) for path in given.GetAttr().GetConnections()):
+                what = "connections of inputs to what is not there are ignored"
+                self._notes.add(what, given.GetAttr().GetPath())
             if port.kind == "texcoord":
                 what = f"textures read the texture coordinates st where {port.name} is not connected"
                 self._notes.add(what, shader.GetPath())
@@ -254,10 +238,7 @@ class _NetworkReader:
         return self._made(definition, output, self._inputs(shader, self._ports(definition)), path)
 
     def _usd_inputs(self, shader: UsdShade.Shader, ports: list[_Port]) -> dict[str, Any]:
-        """Inputs of a shader of USD, of which texture coordinates alone may be connected to others.
-
-        Raises TypeError if there are other numbers of them than by default.
-        """
+        """Inputs of a shader of USD, of which texture coordinates alone may be connected to others."""
         inputs: dict[str, Any] = self._inputs(shader, ports)
         for port in ports:
             value = inputs[port.name]
@@ -429,10 +410,10 @@ class _NetworkReader:
 
 
 _SPECIAL: dict[str, Callable[..., Input | None]] = {
-    "image": _NetworkReader._image,
-    "geompropvalue": _NetworkReader._attribute,
-    "geompropvalueuniform": _NetworkReader._attribute,
-    "normalmap": _NetworkReader._normal,
+    "image": MaterialReader._image,
+    "geompropvalue": MaterialReader._attribute,
+    "geompropvalueuniform": MaterialReader._attribute,
+    "normalmap": MaterialReader._normal,
 }
 
 

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 from mitsuba_subdivision.cage import Attribute, CageContents, CageError, CageSource, require_range, shortened
-from mitsuba_subdivision.files import MeshReader, Skinning, require_types, reversed_order, value_at
+from mitsuba_subdivision.files import MeshReader, Skinning, require_types, value_at
 from mitsuba_subdivision.mesh import IntArray
 from numpy.typing import NDArray
 from pxr import Usd, UsdGeom, UsdLux, UsdShade
@@ -38,10 +38,7 @@ class ShapeReader:
         self._skinning = Skinning(time, notes.add)
 
     def read(self, prim: Usd.Prim, to_world: NDArray[np.float64]) -> list[ShapeContents]:
-        """Shapes of a prim with a transform ``(4, 4)`` for column vectors: one for each material.
-
-        Raises CageError, TypeError, ValueError if it cannot be used.
-        """
+        """Shapes of a prim with a transform ``(4, 4)`` for column vectors: one for each material."""
         location = f"{self._name}, prim {shortened(str(prim.GetPath()))}"
         if not are_invertible(to_world):
             raise CageError(f"{location}: the transform to world space is not invertible; expected one that is")
@@ -72,7 +69,7 @@ class ShapeReader:
             if uv_name is not None and cage.texcoords is not None and not UsdGeom.PrimvarsAPI(prim).HasPrimvar(uv_name):
                 what = f'texture coordinates "{uv_name}" are missing; the first others of the mesh are used'
                 self._notes.add(what, prim.GetPath())
-            normals = read_normals(reader, cage) if cage.scheme is None else None
+            normals = reader.normals(cage) if cage.scheme is None else None
             shown = None
             if len(materials) > 1:
                 if cage.scheme is not None and len(materials) * len(owner) <= MOST_SHARED_FACES:
@@ -175,50 +172,6 @@ def are_invertible(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Mask of the transforms ``(..., 4, 4)`` that are finite and have an inverse."""
     with np.errstate(all="ignore"):
         return np.isfinite(matrices).all(axis=(-2, -1)) & (np.linalg.det(matrices[..., :3, :3]) != 0)
-
-
-def read_normals(reader: MeshReader, cage: CageContents) -> NDArray[np.float64] | None:
-    """Authored normals of a polygon mesh at its face corners, ``(n_h, 3)``, after skinning; None without any.
-
-    They are in the mesh's own space, as the cage. Those that do not fit the mesh are left out, with a message.
-    """
-    mesh = reader.mesh
-    primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
-    is_primvar = primvar and primvar.HasAuthoredValue()
-    attribute = primvar.GetAttr() if is_primvar else mesh.GetNormalsAttr()
-    interpolation = str(primvar.GetInterpolation() if is_primvar else mesh.GetNormalsInterpolation())
-    sizes, corners = cage.face_sizes, len(cage.face_vertices)
-    order = reversed_order(sizes) if reader.is_left_handed() else np.arange(corners)
-    # The element of each face corner, and how many there are.
-    elements: dict[str, tuple[IntArray, int]] = {
-        "vertex": (cage.face_vertices, len(cage.positions)),
-        "varying": (cage.face_vertices, len(cage.positions)),
-        "faceVarying": (order, corners),
-        "uniform": (np.repeat(np.arange(len(sizes)), sizes), len(sizes)),
-        "constant": (np.zeros(corners, np.int64), 1),
-    }
-
-    def read() -> NDArray[np.float64] | None:
-        normals = reader.array(attribute, np.float64, width=3)
-        if not len(normals):
-            return None
-        if interpolation not in elements:
-            raise reader.error(f'normals have the interpolation "{interpolation}"', f"one of {', '.join(elements)}")
-        element, expected = elements[interpolation]
-        indices = np.arange(len(normals))
-        if is_primvar and primvar.IsIndexed():
-            indices = reader.array(primvar.GetIndicesAttr(), np.int64)
-        if len(indices) != expected:
-            raise reader.error(f"there are {len(indices)} {interpolation} normals or indices", str(expected))
-        require_range(indices, len(normals), f"{reader.location}: normals have")
-        if not np.isfinite(normals).all():
-            raise reader.error("there are normals that are not finite", "finite numbers")
-        return normals[indices[element]]
-
-    normals = reader.fitting(attribute, "the normals are left out", read, None)
-    if normals is None:
-        return None
-    return reader.skinning.normals(mesh, cage.positions, cage.face_vertices, normals)
 
 
 def read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[CageContents, NDArray[np.float64] | None]:

@@ -77,10 +77,7 @@ class StageScenes:
         self._needed: dict[str, float] | None = None
 
     def at(self, number: int | None = None) -> SceneContents:
-        """Visible contents of a frame; by default, at the given time.
-
-        Raises CageError, OSError if it cannot be read, or if nothing is visible in a still picture.
-        """
+        """Visible contents of a frame; by default, at the given time, where it is an error if nothing is visible."""
         if self._first is not None and self._first[0] == number:
             return self._first[1]
         contents = self._read(number)
@@ -207,10 +204,7 @@ class StageScenes:
     def frames(
         self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
     ) -> Iterator[studio.LoadedScene]:
-        """The scenes of some frames and sub-frames; what stays, or moves with its topology, stays loaded.
-
-        Raises CageError if there are to be sub-frames, and no camera has a shutter that opens.
-        """
+        """The scenes of some frames and sub-frames; what stays, or moves with its topology, stays loaded."""
         self._surfaces = Surfaces()
         first = self._first[1] if self._first else self.at(numbers[0])
         shapes, parameters = LoadedShapes(), self._with_copies(first)[1]

@@ -1,7 +1,7 @@
 """A whole USD stage as plain data: its meshes, instances, lights and its camera.
 
-Prims are visited from the root on. Invisible prims, guides and proxies are skipped. Instances
-of a prototype that look the same become one group of shapes; where that cannot be, they are copies.
+Invisible prims, guides and proxies are skipped. Instances of a prototype that look the same become one group of shapes;
+where that cannot be, they are copies.
 """
 
 from __future__ import annotations
@@ -58,9 +58,6 @@ class StageReader:
         """Contents of the stage at a time code. Warns about everything that is ignored, once for each kind.
 
         Without a time code, each value is the one that does not depend on time, or else its first sample.
-
-        Raises ValueError if the time is not finite. Raises CageError if there is no such camera. Other errors are those
-        of `open_stage`.
         """
         name = f'"{self._path}"'
         if time is not None and not math.isfinite(time):

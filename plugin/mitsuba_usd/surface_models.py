@@ -255,10 +255,7 @@ def reflectance(ior: Input) -> Input:
 
 
 def conductor(reflectivity: ArrayLike, edge: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Index of refraction and absorption of a metal: [Gulbrandsen 2014], equations 11 to 15.
-
-    From colours (..., 3): what it reflects head-on, and how it turns to white towards grazing angles.
-    """
+    """Refraction and absorption of a metal, by its reflectivity and edge colour: [Gulbrandsen 2014], (11) to (15)."""
     r, g = np.clip(reflectivity, 0, 0.99), np.clip(edge, 0, 1)
     root = np.sqrt(r)
     n = g * (1 - r) / (1 + r) + (1 - g) * (1 + root) / (1 - root)

@@ -59,10 +59,7 @@ def read_texture_image(
     needed: float = math.inf,
     most: int | None = None,  # Pixels along the sides of a file at most
 ) -> TextureImage:
-    """Read the image of a texture.
-
-    Raises OSError, RuntimeError, KeyError, zipfile.BadZipFile if it cannot be read, or there is no tile.
-    """
+    """Read the image of a texture. Raises OSError, RuntimeError, KeyError, zipfile.BadZipFile if it cannot be read."""
     if UDIM not in path:
         return TextureImage(_pixels(path, color_space, needed, most), np.eye(3))
     from pxr import UsdShade

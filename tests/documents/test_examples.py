@@ -33,7 +33,7 @@ from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.contents import RULES
 from mitsuba_subdivision.figures import FIGURES
 from mitsuba_subdivision.files.formats import FORMATS
-from mitsuba_subdivision.files.obj_reader import read_obj
+from mitsuba_subdivision.files.obj import read_obj
 from mitsuba_subdivision.regression.tiers import TIERS
 from mitsuba_subdivision.shapes.parameter_table import PARAMETERS, STATE_PARAMETERS
 

@@ -45,7 +45,7 @@ def test_neither_cages_nor_files_are_imported_with_the_package_and_libraries_onl
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     package, cage, reader, surface = (set(line.split()) for line in done.stdout.split("\n")[: len(lines)])
     assert package == {name for name in cage if ".files" in name} == set()
-    assert "mitsuba_subdivision.files.obj_reader" in reader
+    assert "mitsuba_subdivision.files.obj" in reader
     assert not {"pxr", "plyfile"} & (reader | surface)
 
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage, contents
 from mitsuba_subdivision.cage.contents import same
 from mitsuba_subdivision.cage.named_cages import extraordinary
-from mitsuba_subdivision.files.obj_reader import read_obj
+from mitsuba_subdivision.files.obj import read_obj
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 

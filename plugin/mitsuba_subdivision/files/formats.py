@@ -43,7 +43,7 @@ class Format(NamedTuple):
 _USD = Format("usd_reader:read_usd", "usd_writer:write_usd", "usd_writer:write_usd_triangles", True, True, up=None)
 # Formats by suffix. OBJ files of Blender, Maya and Houdini have y up, PLY files of Blender z.
 FORMATS = {
-    ".obj": Format("obj_reader:read_obj", "obj_writer:write_obj", "obj_writer:write_obj_triangles"),
+    ".obj": Format("obj:read_obj", "obj:write_obj", "obj:write_obj_triangles"),
     ".ply": Format("ply:read_ply", "ply:write_ply", "ply:write_ply_triangles", up="z"),
     ".usd": _USD,
     ".usda": _USD,
@@ -96,11 +96,7 @@ def write_triangles(
     texcoords: NDArray | None = None,  # (n, 2)
     attributes: Mapping[str, NDArray] | None = None,  # (n, k) each
 ) -> None:
-    """Write triangles on a limit surface and the data at their vertices. The file appears whole or not at all.
-
-    Raises ValueError if the format is unknown. Raises CageError if the package usd-core, which writes USD files, is
-    missing. Raises OSError if the file cannot be written. Warns if the format cannot hold an attribute, or its name.
-    """
+    """Write triangles on a limit surface and the data at their vertices; see `Tessellation.save`."""
     write = function_named(FORMATS[require_triangle_format(path)].write_triangles)
     write(path, positions, normals, triangles, texcoords, attributes or {})
 

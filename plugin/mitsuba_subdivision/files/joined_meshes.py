@@ -32,8 +32,7 @@ def joined(
     """Contents of one cage with the vertices and faces of all meshes, one mesh after the other.
 
     Texture coordinates and attributes are kept if all meshes have them, with the same interpolation and width, else
-    there is a warning. The source names vertices and faces by their mesh and their numbers there. Raises CageError if
-    meshes have different rules or schemes.
+    there is a warning. Meshes of different rules or schemes are an error.
     """
     if len(meshes) == 1:
         return meshes[0]

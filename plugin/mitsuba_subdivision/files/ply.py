@@ -46,9 +46,6 @@ def read_ply(path: str | Path) -> CageContents:
     Polygons are the list ``vertex_indices`` or ``vertex_index`` of the element ``face``. Normals are dropped, as those
     of the surface follow from its points. Of the properties of vertices, `_TEXCOORDS` name texture coordinates, and
     `grouped` makes attributes of all others; unsigned integers of colours are scaled to 0 to 1.
-
-    Raises CageError if the package plyfile is missing, or the file is malformed, OSError if it cannot be read. The cage
-    itself is not validated. Warns if faces have other data, or vertices have lists, which are not read.
     """
     name, content = f'"{path}"', Path(path).read_bytes()
     header = content[: max(0, content.find(b"end_header"))]
@@ -224,8 +221,7 @@ def grouped(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
 def write_ply(contents: CageContents, path: str | Path) -> None:
     """Write the polygons of a cage, their materials, and its data at vertices, to a PLY file in double precision.
 
-    Raises OSError if the file cannot be written. Warns of what it cannot hold. Of materials, these are names other than
-    "material_0" and so on, and all but one of a face.
+    Of materials, names other than "material_0" and so on are lost, and all but one of a face.
     """
     texcoords = contents.texcoords
     if texcoords is not None and texcoords.interpolation != "vertex":
@@ -309,7 +305,7 @@ def write_polygons(
     face_vertices: NDArray,  # (sum of face_sizes,) int: 0-based
     materials: NDArray | None = None,  # (n_f,) int: number of each face's material; negative for none
 ) -> None:
-    """Write polygons to a binary PLY file, whole or not at all. Raises OSError if the file cannot be written."""
+    """Write polygons to a binary PLY file, whole or not at all."""
     types = {name: values.dtype.newbyteorder("<") for name, values in properties.items()}
     vertices = np.empty(len(next(iter(properties.values()))), dtype=list(types.items()))
     for name, values in properties.items():

@@ -138,8 +138,7 @@ class MeshReader:
     def fitting(self, attribute: Usd.Attribute, consequence: str, read: Callable[[], Read], otherwise: Read) -> Read:
         """What a function reads of an attribute; something else, with a report, where that does not fit the mesh.
 
-        The report ends with the consequence: "the creases are left out". Raises CageError as ``read`` does, if nothing
-        takes reports.
+        The report ends with the consequence: "the creases are left out". If nothing takes reports, it is an error.
         """
         try:
             return read()
@@ -302,7 +301,6 @@ class MeshReader:
         Primvars of floating-point numbers are read. The first of "st", "UVMap" and "texcoords" that there is gives the
         texture coordinates, or else the first primvar of the type ``texCoord2``. Skipped without a warning are normals,
         which follow from the surface, joints and their weights, and primvars with a single value for the whole mesh.
-        Warns if primvars have other types, or one value per face, and are not read.
         """
         from pxr import UsdGeom
 
@@ -323,7 +321,9 @@ class MeshReader:
             if table is None or interpolation not in known:
                 left_out[str(attribute.GetPath())] = f'"{name}" ({kind}, {interpolation})'
                 continue
-            read = partial(self._primvar, primvar, table, order, topology, 2 if name == first_name else None)
+            indexed = primvar.GetIndicesAttr() if primvar.IsIndexed() else None
+            width = 2 if name == first_name else None
+            read = partial(self._attribute, name, table, indexed, interpolation, order, topology, width)
             values = self.fitting(attribute, "the primvar is left out", read, None)
             if values is not None:
                 attributes[name] = values
@@ -340,29 +340,57 @@ class MeshReader:
         kept = attributes.keys() - {first} if chosen is None else chosen
         return texcoords, {name: values for name, values in attributes.items() if name in kept}
 
-    def _primvar(
+    def normals(self, cage: CageContents) -> NDArray[np.float64] | None:
+        """Authored normals of a polygon mesh in its own space, ``(n_h, 3)`` at face corners after skinning, if any."""
+        from pxr import UsdGeom
+
+        mesh, primvar = self.mesh, UsdGeom.PrimvarsAPI(self.mesh).GetPrimvar("normals")
+        is_primvar = primvar and primvar.HasAuthoredValue()
+        attribute = primvar.GetAttr() if is_primvar else mesh.GetNormalsAttr()
+        interpolation = primvar.GetInterpolation() if is_primvar else mesh.GetNormalsInterpolation()
+        topology = Topology(len(cage.positions), cage.face_sizes, cage.face_vertices)
+
+        def read() -> NDArray[np.float64] | None:
+            values = self.array(attribute, np.float64, width=3)
+            if not len(values):
+                return None
+            known = (*INTERPOLATIONS, "uniform", "constant")
+            if interpolation not in known:
+                raise self.error(f'normals have the interpolation "{interpolation}"', f"one of {', '.join(known)}")
+            indexed = primvar.GetIndicesAttr() if is_primvar and primvar.IsIndexed() else None
+            order = reversed_order(cage.face_sizes) if self.is_left_handed() else None
+            normals = self._attribute("normals", values, indexed, interpolation, order, topology)
+            return normals.values[topology.face_vertices if normals.indices is None else normals.indices]
+
+        normals = self.fitting(attribute, "the normals are left out", read, None)
+        if normals is None:
+            return None
+        return self.skinning.normals(mesh, cage.positions, cage.face_vertices, normals)
+
+    def _attribute(
         self,
-        primvar: UsdGeom.Primvar,
+        name: str,
         values: NDArray[np.float64],
-        order: IntArray | None,
+        indexed: Usd.Attribute | None,
+        interpolation: str,
+        order: IntArray | None,  # As for `_primvars`
         topology: Topology,
-        width: int | None,
+        width: int | None = None,
     ) -> Attribute:
-        """A primvar as an attribute."""
-        where = f'{self.location}: primvar "{shortened(primvar.GetPrimvarName())}"'
-        indices = self.array(primvar.GetIndicesAttr(), np.int64) if primvar.IsIndexed() else None
-        interpolation = primvar.GetInterpolation()
+        """An attribute of a primvar; values of whole faces or of the mesh become those of face corners."""
+        where = f'{self.location}: primvar "{shortened(name)}"'
+        sizes, vertices = topology.face_sizes, topology.face_vertices
+        indices = None if indexed is None else self.array(indexed, np.int64)
         if interpolation in ("vertex", "varying"):
             if indices is not None:
                 require_range(indices, len(values), f"{where} has")
-                values = values[indices]
-            attribute = Attribute(values, INTERPOLATIONS[interpolation])
+                values, indices = values[indices], None
         else:
-            sizes, vertices = topology.face_sizes, topology.face_vertices
             rows, count, per = order, len(vertices), "face corner"
             if interpolation == "uniform":
-                # Values of faces become those of their corners, which a change of the orientation leaves as they are.
                 rows, count, per = np.repeat(np.arange(len(sizes)), sizes), len(sizes), "face"
+            elif interpolation == "constant":
+                rows, count, per = np.zeros(len(vertices), np.int64), 1, "mesh"
             elif indices is None:
                 # The order is its own inverse.
                 values, indices = _with_shared_values(values, sizes, vertices if order is None else vertices[order])
@@ -371,8 +399,8 @@ class MeshReader:
                 if len(indices) != count:
                     raise CageError(f"{where} has {len(indices)} values or indices; expected {count}, one per {per}")
                 indices = indices[rows]
-            attribute = Attribute(values, "face_varying", indices)
-        return validated_attribute(attribute, primvar.GetPrimvarName(), topology, self._source, width=width)
+        attribute = Attribute(values, INTERPOLATIONS.get(interpolation, "face_varying"), indices)
+        return validated_attribute(attribute, name, topology, self._source, width=width)
 
 
 def _table(value: Any, element_size: int) -> NDArray[np.float64] | None:

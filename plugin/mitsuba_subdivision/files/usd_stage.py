@@ -54,11 +54,7 @@ def open_stage(
     # Makes of the stage and the beginning of messages one that has what USD itself cannot open
     completed: Callable[[Usd.Stage, str], Usd.Stage] | None = None,
 ) -> Usd.Stage:
-    """Open the stage of a file, with everything that it refers to.
-
-    Raises OSError if the file cannot be read. Raises CageError if the package usd-core is missing, or the file is
-    malformed. Warns if the file refers to something that is not there.
-    """
+    """Open the stage of a file, with everything that it refers to. Warns if something of it is not there."""
     with Path(path).open("rb"):
         pass  # So that a missing file is an OSError, as for other formats.
     name = f'"{path}"'
@@ -234,10 +230,8 @@ def chosen_meshes(
 ) -> list[UsdGeom.Mesh]:
     """The mesh to read, or all meshes.
 
-    Meshes that are not to be smoothed are skipped if there are others. If all meshes are requested, so are meshes that
-    renderers do not show. Warns if meshes are skipped.
-
-    Raises CageError if there is no such mesh, or more than one and not all are requested.
+    Meshes that are not to be smoothed are skipped if there are others, with a warning. If all meshes are requested, so
+    are meshes that renderers do not show.
     """
     from pxr import Sdf, Usd, UsdGeom
 

@@ -20,11 +20,7 @@ if TYPE_CHECKING:
 
 
 def write_usd(contents: CageContents, path: str | Path) -> None:
-    """Write a cage to a USD file in single precision, with its subdivision attributes and primvars.
-
-    A cage that names no scheme becomes a Catmull-Clark mesh. Raises CageError if the package usd-core is missing,
-    OSError if the file cannot be written. Warns of what it cannot hold.
-    """
+    """Write a cage to a USD file in single precision, with its primvars; without a scheme, as Catmull-Clark mesh."""
     with _new_mesh(path, "cage", contents.positions, contents.face_sizes, contents.face_vertices) as mesh:
         attributes = {name: values for name, values in contents.attributes.items() if is_possible(name)}
         warn_of_losses(
