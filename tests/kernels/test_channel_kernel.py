@@ -24,6 +24,8 @@ STEP, DIFFERENCES = 1e-6, 1e-7
 
 BASES = {
     "mixed torus": ("catmull_clark", mixed_torus),
+    "linear": ("catmull_clark", mixed_torus),
+    "loop linear": ("loop", lambda: triangulated(mixed_torus())),
     "sheet": ("catmull_clark", lambda: sheet(4, 3)),
     "crease": ("catmull_clark", lambda: spokes(extraordinary(5, closed=False), 5, (10, 0, 1.5))),
     "loop": ("loop", lambda: triangulated(mixed_torus())),
@@ -48,7 +50,8 @@ def surface(request):
         }
     else:
         attributes["no seams 2"] = Attribute(rng.random((t.vertex_count, 2)), "face_varying", t.face_vertices)
-    return LimitSurface(tagged(cage, creases=cage.tags.creases(t), attributes=attributes), scheme)
+    linear = {"face_varying": "all"} if "linear" in request.param else {}
+    return LimitSurface(tagged(cage, creases=cage.tags.creases(t), attributes=attributes, **linear), scheme)
 
 
 @lru_cache(maxsize=4)
@@ -76,19 +79,6 @@ def test_values_are_the_channels(surface, variant, np_rng):
         expected = surface.evaluate_attribute(name, *locations)
         assert values.shape == expected.shape
         np.testing.assert_allclose(values, expected, rtol=0, atol=ROUNDING[variant])
-
-
-@pytest.mark.core
-def test_values_by_linear_rules_are_the_channels(surface, np_rng):
-    if surface.scheme.element == "vertex":
-        pytest.skip("a scheme without linear interpolation")
-    attributes = surface.cage.attributes
-    surface = LimitSurface(tagged(surface.cage, attributes=attributes, face_varying="all"), surface.scheme.name)
-    locations = random_locations(surface, np_rng, 600)
-    for name in ("varying 1", "seams 2"):
-        assert surface.channel(name).layout.is_linear
-        values, *_ = evaluated(surface, name, DOUBLE, *locations)
-        np.testing.assert_allclose(values, surface.evaluate_attribute(name, *locations), rtol=0, atol=ROUNDING[DOUBLE])
 
 
 def test_derivatives_are_differences(surface, np_rng):
