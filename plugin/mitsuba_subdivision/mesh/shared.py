@@ -24,7 +24,7 @@ class Content:
         self,
         array: NDArray | None,  # Must not be changed afterwards
     ) -> None:
-        self.array = array
+        self.array: Any = array
         self._hash = 0 if array is None else hash((array.shape, zlib.crc32(np.ascontiguousarray(array).data)))
 
     def __hash__(self) -> int:

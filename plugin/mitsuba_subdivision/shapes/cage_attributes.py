@@ -10,19 +10,18 @@ change and be differentiated.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 from weakref import WeakMethod
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from ..cage.errors import warn
 from ..device_arrays import mapped, upload
-from ..kernels.array_types import Float, FloatBuffer, Index, Mask, Value
-from ..mesh.shared import Content, Shared, SharedArray, shared
+from ..kernels.array_types import Float, FloatBuffer, Index, Value
+from ..mesh.shared import Content, SharedArray, shared
 from ..variants import Variant
 from .derivatives import computed_ones, warn_of_lost, watched
 from .device_state import flat_type, require_values
@@ -47,7 +46,6 @@ _MARK, _WORD = 4, 4
 _BLACK, _WHITE = -8192.0, 8192.0
 # Lower bound of the largest component of a colour, by which the other components are divided.
 _DARKEST = 1e-6
-_UPLOADED: Shared[SharedArray] = Shared()
 
 
 class CageAttributes:
@@ -72,13 +70,15 @@ class CageAttributes:
     ) -> None:
         self._on_backward = on_backward
         self._source = surface.cage.source.name
-        self._float = variant.Float if dr.is_jit_v(variant.Float) else None
+        self._kind, self._is_jit = flat_type(variant), dr.is_jit_v(variant.Float)
         self._channels: dict[str, Channel] = {name: surface.channel(name) for name in names}
         # Meshes with equal values share memory until values are assigned.
-        self._given = {name: self._upload(channel.values) for name, channel in self._channels.items()}
+        self._given = {
+            name: shared(_uploaded, self._kind, Content(channel.values)) for name, channel in self._channels.items()
+        }
         # Control values by names of parameters, such as "cage_texcoords"
         self.values: dict[str, FloatBuffer] = {
-            f"{PREFIX}{name}": flat_type(variant)(shared.array) for name, shared in self._given.items()
+            f"{PREFIX}{name}": self._kind(given.array) for name, given in self._given.items()
         }
         # Names of the parameters that move vertices
         self.moving = set() if displaces is None else {f"{PREFIX}{displaces}"}
@@ -96,12 +96,12 @@ class CageAttributes:
             discontinuity = flags.Discontinuous if name in self.moving else flags.Differentiable
             callback.put(name, values, flags.Differentiable | discontinuity)
 
-    def set_triangles(self, attributes: AttributeTable) -> None:
-        """Set the tessellation whose vertices have attributes."""
+    def set_triangles(self, attributes: AttributeTable, names: Container[str]) -> None:
+        """Set the tessellation, whose vertices have the attributes that are among ``names``."""
         self._uploaded = {
-            name: self._upload(values.astype(np.float32))
-            for name, values in attributes.values.items()
-            if name in self._channels
+            name: shared(_uploaded, self._kind, Content(attributes.values[name].astype(np.float32)))
+            for name in self._channels
+            if name in names
         }
         self._locations = attributes.layout.locate
         self._weights: dict[ChannelLayout, Any] = {}
@@ -137,21 +137,13 @@ class CageAttributes:
                 buffers[mesh_name(name)] = self._upsampling[name].stored(values) if name in self._upsampling else values
         return buffers
 
-    def _upload(self, values: NDArray[np.floating]) -> SharedArray:
-        """Flat array of values; in JIT variants, meshes with equal values share it."""
-        kind = self._float
-        if kind is None:
-            return SharedArray(values.ravel())
-        # Copied to memory of Dr.Jit, as frozen functions may replace the array.
-        return _UPLOADED.get((kind, Content(values)), lambda: SharedArray(dr.opaque(mapped(kind, values))))
-
     def _at_vertices(self, name: str) -> FloatBuffer:
         if name not in self._moved:
             return self._uploaded[name].array
         values, channel = self._moved[name], self._channels[name]
         weights = self._weights_of(channel)
         size = channel.values.shape[1]
-        if self._float is not None:
+        if self._is_jit:
             return weights(values, size)
         vertex_values = weights @ np.array(values, dtype=np.float64).reshape(-1, size)
         return np.asarray(vertex_values, dtype=np.float32).ravel()
@@ -167,10 +159,10 @@ class CageAttributes:
         # Attributes of the same layout share weights.
         if channel.layout not in self._weights:
             weights: Any = channel.weights(*self._locations())
-            if self._float is not None:
+            if self._is_jit:
                 from ..kernels.linear_maps import SparseMatrix
 
-                weights = SparseMatrix(weights, self._float)
+                weights = SparseMatrix(weights, self._kind)
             self._weights[channel.layout] = weights
         return self._weights[channel.layout]
 
@@ -181,6 +173,12 @@ class CageAttributes:
         self._moved[name] = values
         if name in self._followers:
             self._followers[name](values)
+
+
+def _uploaded(kind: type, values: Content) -> SharedArray:
+    """Flat array of values, which meshes with equal values share."""
+    # Copied to memory of Dr.Jit, as frozen functions may replace the array.
+    return SharedArray(dr.opaque(mapped(kind, values.array)) if dr.is_jit_v(kind) else np.ravel(values.array))
 
 
 def mesh_name(name: str) -> str:
@@ -257,7 +255,8 @@ class SpectralUpsampling:
         index = variant.UInt32
         x = dr.minimum(index(dr.detach(first)), last - 1)
         y = dr.minimum(index(dr.detach(second)), last - 1)
-        z = self._interval(dr.detach(largest))
+        # The last level that is not above the largest component.
+        z = dr.binary_search(1, last, lambda z: dr.gather(variant.Float, self._levels, z) <= dr.detach(largest)) - 1
         level = dr.gather(variant.Float, self._levels, z)
         height = (largest - level) / (dr.gather(variant.Float, self._levels, z + 1) - level)
         part = dr.select(is_blue, index(2), dr.select(is_green, index(1), index(0)))
@@ -275,15 +274,6 @@ class SpectralUpsampling:
         is_grey = (r == g) & (g == b)
         grey = dr.replace_grad(self._grey(dr.detach(b)), coefficients)  # type: ignore[func-returns-value]  # The stub is wrong.
         return dr.select(is_grey, grey, coefficients)
-
-    def _interval(self, largest: Float) -> Index:
-        """Index of the last level that is not above ``largest``."""
-        last = self._resolution - 1
-
-        def is_above(level: Index) -> Mask:
-            return dr.gather(self._variant.Float, self._levels, level) <= largest
-
-        return dr.binary_search(1, last, is_above) - 1
 
     def _grey(self, value: Float) -> Value:
         is_inside = (value > 0) & (value < 1)

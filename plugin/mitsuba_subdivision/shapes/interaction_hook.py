@@ -38,7 +38,6 @@ from .device_state import paused_collection, traversed
 from .machine_code import (
     BEFORE,
     address_of,
-    bindings,
     calling_after,
     calling_before,
     declaration_at,
@@ -79,7 +78,6 @@ def hook_problem() -> str | None:
     if not (sys.platform == "linux" and platform.machine() == "x86_64" and sys.implementation.name == "cpython"):
         return f"needs CPython on Linux on x86-64, until Mitsuba 3.10; this is {platform.platform(terse=True)}"
     try:
-        bindings()
         require_trampolines()
     except AttributeError as error:
         return f"needs the functions of Mitsuba's bindings by their names: {error}"

@@ -232,8 +232,8 @@ def tag_of(address: int) -> int:
 def require_trampolines() -> None:
     """Check that trampolines work on this system.
 
-    Raises OSError if the system does not allow memory that was written to be executed. Raises AttributeError if the
-    libraries lack a required function.
+    Raises OSError if the library of the bindings is missing, or the system does not allow memory that was written to be
+    executed. Raises AttributeError if the libraries lack a required function.
     """
     _assembled(_AFTER, original=0, kind=0, function=0)
     _protect(_writable_page(), mmap.PROT_READ | mmap.PROT_EXEC)

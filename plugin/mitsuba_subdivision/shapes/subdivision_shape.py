@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TYPE_CHECKING
 from weakref import WeakMethod
 
@@ -63,14 +62,18 @@ def make_subdivision(
             # Dr.Jit's variable indices of the mesh's buffers when they were last set, and their lengths.
             self._evaluated: dict[str, int] = {}
             self._lengths: dict[str, int] = {}
-            # Mitsuba samples textured emitters by the mesh's texture coordinates.
-            self._has_textured_emitter = _has_textured_emitter(props, variant)
             self._placement = Placement(surface.cage.positions, kind, recentres=parameters.evaluator == "stabilized")
             self._exact: ExactShading | None = None
             self._has_texcoords = TEXCOORDS in surface.attribute_names
+            # Attributes at vertices.
+            self._at_vertices = surface.attribute_names
             if is_exact:
                 from .exact_shading import ExactShading
 
+                # Texture coordinates are evaluated at hits, so that their seams need no copies of vertices. But Mitsuba
+                # samples textured emitters by those of the mesh.
+                if not _has_textured_emitter(props, variant):
+                    self._at_vertices = tuple(name for name in self._at_vertices if name != TEXCOORDS)
                 self._exact = ExactShading(variant, parameters, self._placement.positions)
             self._displacement: ShapeDisplacement | None = None
             if parameters.displacement is not None:
@@ -93,7 +96,6 @@ def make_subdivision(
                 self.control_points = dr.opaque(self.control_points)
             # From a list: with a NumPy array, the compiled kernel would depend on the alignment of its memory.
             self.to_world = variant.AffineTransform4f(parameters.to_world.tolist())
-            self._placement.take(self.to_world, parameters.to_world)
             drawn = self._exact, self._displacement
             on_moved = WeakMethod(self.renew_derivatives)
             self._mesh = MeshBuffers(variant, parameters, self._placement, *drawn, on_moved)
@@ -105,7 +107,7 @@ def make_subdivision(
                 face_count=0,
                 props=props,
                 has_vertex_normals=not (parameters.face_normals or is_exact),
-                has_vertex_texcoords=self._has_texcoords and (not is_exact or self._has_textured_emitter),
+                has_vertex_texcoords=TEXCOORDS in self._at_vertices,
             )
             if self._exact is not None:
                 from .interaction_hook import interaction_hook
@@ -120,22 +122,19 @@ def make_subdivision(
             self._assemble(moves_points=False)
 
         def _prepare(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> None:
-            """Select triangles and the evaluator of their vertices."""
+            """Place the shape, and select its triangles and the evaluator of their vertices."""
+            self._placement.take(self.to_world, to_world)
             parameters, surface = self._parameters, self._parameters.surface
             is_adaptive = self._tessellation.limit is not None
             bound = self._displacement.bound() if self._displacement is not None and is_adaptive else None
             table = self._tessellation.table(surface, control_points, to_world, bound)
             kept = None if parameters.shown is None else np.flatnonzero(parameters.shown[table.element])
-            # Exact shading evaluates texture coordinates at hits, so that their seams need no copies of vertices. Those
-            # of displaced vertices are averaged over copies along all seams.
-            names = surface.attribute_names
-            if self._exact is not None and not self._has_textured_emitter:
-                names = tuple(name for name in names if name != TEXCOORDS)
-            attributes = surface.attribute_table(table, names if self._displacement is None else None)
-            attributes = replace(attributes, values={name: attributes.values[name] for name in names})
+            # Displaced vertices are averaged over copies along all seams.
+            names = self._at_vertices if self._displacement is None else None
+            attributes = surface.attribute_table(table, names)
             if self._exact is not None:
                 self._exact.set_triangles(table, kept)
-            self._cage.set_triangles(attributes)
+            self._cage.set_triangles(attributes, self._at_vertices)
             self._mesh.set_triangles(table, attributes.layout, kept)
             self._has_outlines = False
 
@@ -160,9 +159,7 @@ def make_subdivision(
             self._require_unfrozen()
             self._require_control_points(are_new=True)
             points = np.array(self.control_points, dtype=np.float64).reshape(-1, 3)
-            to_world = checked_matrix(self.to_world)
-            self._placement.take(self.to_world, to_world)
-            self._prepare(points, to_world)
+            self._prepare(points, checked_matrix(self.to_world))
             self._assemble(moves_points=True)
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -195,12 +192,12 @@ def make_subdivision(
                 return
             if self._displacement is not None and "displacement_scale" in keys:
                 self._displacement.take_scale()
-            if "to_world" in keys:
-                self._placement.take(self.to_world, to_world)
             if tessellation is not self._tessellation:
                 self._tessellation = tessellation
                 self.retessellate()
                 return
+            if "to_world" in keys:
+                self._placement.take(self.to_world, to_world)
             buffers = self._mesh.evaluated(self.control_points, moves_points="control_points" in keys)
             buffers |= self._cage.buffers(attributes)
             if self._placement.mirrors != self._has_turned_faces:
@@ -335,39 +332,30 @@ def make_subdivision(
             doubled = dr.select(squared > 0, dr.sqrt(dr.select(squared > 0, squared, 1)), 0)
             return dr.replace_grad(area, dr.sum(doubled) / 2)
 
-        def vertex_normal(self, index: Index, active: Mask = True) -> Vector3:
-            """Normal at a vertex of the mesh.
+        # The following methods raise RuntimeError if the mesh has no such values at its vertices: Mitsuba would read
+        # beyond the end of a buffer.
 
-            Raises RuntimeError if the mesh has no normals: Mitsuba would read beyond the end of the buffer.
-            """
+        def vertex_normal(self, index: Index, active: Mask = True) -> Vector3:
+            """Normal at a vertex of the mesh."""
             self._require_at_vertices("vertex_normal", "normals", self.has_vertex_normals())
             return super().vertex_normal(index, active)
 
         def vertex_texcoord(self, index: Index, active: Mask = True) -> Vector2:
-            """Texture coordinates at a vertex of the mesh.
-
-            Raises RuntimeError if the mesh has no texture coordinates: Mitsuba would read beyond the end of the buffer.
-            """
+            """Texture coordinates at a vertex of the mesh."""
             self._require_at_vertices("vertex_texcoord", "texture coordinates", self.has_vertex_texcoords())
             return super().vertex_texcoord(index, active)
 
         def eval_parameterization(
             self, uv: Vector2, ray_flags: int = int(mi.RayFlags.All), active: Mask = True
         ) -> mi.SurfaceInteraction3f:
-            """Interaction at the point of the surface with given texture coordinates; invalid where there is none.
-
-            Raises RuntimeError if the cage has no texture coordinates.
-            """
+            """Interaction at the point of the surface with given texture coordinates; invalid where there is none."""
             self._require_at_vertices("eval_parameterization", "texture coordinates", self._has_texcoords)
             if self._exact is None or self.has_vertex_texcoords():
                 return super().eval_parameterization(uv, ray_flags, active)
             return self._exact.at_texcoords(variant.Point2f(uv), int(ray_flags), variant.Mask(active))
 
         def recompute_vertex_normals(self) -> None:
-            """Replace the normals of the limit surface by averages of triangle normals.
-
-            Raises RuntimeError if the mesh has no normals.
-            """
+            """Replace the normals of the limit surface by averages of triangle normals."""
             self._require_at_vertices("recompute_vertex_normals", "normals", self.has_vertex_normals())
             super().recompute_vertex_normals()
 
