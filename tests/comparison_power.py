@@ -26,7 +26,7 @@ import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision.regression.compare import compare
 from mitsuba_subdivision.regression.image import Image, load_image, save_image
-from mitsuba_subdivision.regression.passes import Sampling, render_pass
+from mitsuba_subdivision.regression.renders import Sampling, render_pass
 from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.regression.tiers import Status
 from regression.defects import stam

@@ -9,7 +9,7 @@ import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.commands import render
 from mitsuba_subdivision.regression import RegressionError
-from mitsuba_subdivision.regression.passes import Sampling, merge_passes, render_on_cluster, render_pass
+from mitsuba_subdivision.regression.renders import Sampling, merge_passes, render_on_cluster, render_pass
 from mitsuba_subdivision.regression.scene import load_scene
 from regression.defects import SCENES
 

@@ -181,7 +181,7 @@ def test_a_missing_pass_is_told(passes, capsys, tmp_path):
 def test_a_reference_that_is_not_finite_is_not_written(tmp_path, capsys, monkeypatch):
     pixels = np.ones((16, 16, 3), np.float32)
     pixels[3, 5, 1] = np.nan
-    monkeypatch.setattr("mitsuba_subdivision.regression.passes.render_pixels", lambda *_: pixels)
+    monkeypatch.setattr("mitsuba_subdivision.regression.renders.render_pixels", lambda *_: pixels)
     assert main(["render", SCENE, "-o", str(tmp_path / "reference.exr"), "--reference", "--spp", "16", *SMALL]) == 1
     assert "is not finite: G = nan at x = 5, y = 3; channels G, variance.G" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

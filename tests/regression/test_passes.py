@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.regression import RegressionError
 from mitsuba_subdivision.regression.image import Estimate, combine, load_image, save_image
-from mitsuba_subdivision.regression.passes import Sampling, merge_passes, render_pass
+from mitsuba_subdivision.regression.renders import Sampling, merge_passes, render_pass
 from mitsuba_subdivision.regression.scene import load_scene
 from regression.defects import SCENES
 from regression.random_images import BATCH, SPREAD, estimate, truth

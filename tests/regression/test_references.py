@@ -6,7 +6,7 @@ import mitsuba as mi
 import pytest
 from mitsuba_subdivision.regression.compare import compare
 from mitsuba_subdivision.regression.image import load_image
-from mitsuba_subdivision.regression.references import compare_scene, render_like
+from mitsuba_subdivision.regression.renders import compare_scene, render_like
 from mitsuba_subdivision.regression.tiers import Status, Tolerances
 from regression.defects import DEFECTS, RESOLUTION, SCENES, scene_of
 

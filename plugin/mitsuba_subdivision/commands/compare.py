@@ -86,7 +86,7 @@ def _compare(options: argparse.Namespace) -> int:
         require_folder(options.html)
         require_writable(options.html / "index.html")
     if test is None:
-        from ..regression.references import TEST_SPP, compare_scene, variant_for
+        from ..regression.renders import TEST_SPP, compare_scene, variant_for
 
         with variant_set(variant_for(reference)):
             sampling = {"spp": options.spp or TEST_SPP, "seed": options.seed or 0}
@@ -108,7 +108,7 @@ def _compare(options: argparse.Namespace) -> int:
 
 def _merge(options: argparse.Namespace) -> None:
     from ..regression.image import load_image, require_finite, save_image
-    from ..regression.passes import merge_passes, missing_passes
+    from ..regression.renders import merge_passes, missing_passes
 
     if options.output.suffix.lower() != ".exr":
         raise RegressionError(f'output "{options.output}"; expected a name ending in .exr')

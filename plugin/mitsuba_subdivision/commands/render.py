@@ -324,9 +324,8 @@ def _render_by_passes(options: argparse.Namespace, *, is_model: bool = False) ->
 
     Raises RegressionError if there are fewer batches than passes, or no cluster answers.
     """
+    from ..regression import renders
     from ..regression.image import save_image
-    from ..regression.passes import BATCH, LEAST_BATCHES, Sampling, merge_passes, render_on_cluster, render_pass
-    from ..regression.references import REFERENCE_SPP, as_reference
 
     # Workers get it, too, and may be in another folder.
     load: Callable[[], LoadedScene] = partial(_load_still, _as_data(options))
@@ -335,25 +334,26 @@ def _render_by_passes(options: argparse.Namespace, *, is_model: bool = False) ->
         load = partial(load_scene, path, dict(options.parameters), BOX if options.reference else options.filter)
     loaded = load()
     require_writable(options.output, loaded.file_paths)
-    spp = options.spp or (REFERENCE_SPP if options.reference else loaded.sensor.sampler().sample_count())
+    spp = options.spp or (renders.REFERENCE_SPP if options.reference else loaded.sensor.sampler().sample_count())
     tolerances = Tolerances().with_values(dict(options.tolerances))
     number, count = options.share or (1, options.passes or 1)
-    batch = options.batch or min(BATCH, max(1, spp // max(LEAST_BATCHES, count)))
+    batch = options.batch or min(renders.BATCH, max(1, spp // max(renders.LEAST_BATCHES, count)))
     if is_model:
         # Mitsuba would round each batch up, and more samples than recorded would count.
         batch = sampler(batch)["sample_count"]
-    sampling = Sampling(max(1, -(-spp // batch)), batch, options.seed)
+    sampling = renders.Sampling(max(1, -(-spp // batch)), batch, options.seed)
     settings = {"with_probe": options.reference}
     with threads_set(options.threads):
         if options.dask:
             variant = str(mi.variant())
-            image = render_on_cluster(options.dask, load, variant, sampling, options.passes or 0, **settings)
+            image = renders.render_on_cluster(options.dask, load, variant, sampling, options.passes or 0, **settings)
         elif options.share:
-            image = render_pass(loaded, sampling, number, count, **settings)
+            image = renders.render_pass(loaded, sampling, number, count, **settings)
         else:
-            image = merge_passes([render_pass(loaded, sampling, i, count, **settings) for i in range(1, count + 1)])
+            passes = (renders.render_pass(loaded, sampling, i, count, **settings) for i in range(1, count + 1))
+            image = renders.merge_passes(list(passes))
     if options.reference:
-        image = as_reference(image, options.scene, options.output, sampling, tolerances)
+        image = renders.as_reference(image, options.scene, options.output, tolerances)
     save_image(options.output, image)
     print_result(options.output)
 
@@ -371,7 +371,7 @@ def _load_still(given: dict[str, Any]) -> LoadedScene:
 
 
 def _on_cluster(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    from ..regression.passes import cluster, results
+    from ..regression.renders import cluster, results
 
     # The command's own number: files may change until the next one.
     command = pickle.dumps(_as_data(options) | {"command": uuid4().hex})

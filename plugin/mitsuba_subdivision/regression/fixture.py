@@ -18,14 +18,16 @@ from ..variants import chosen_variant, variant_set
 from . import RegressionError
 from .compare import Comparison
 from .image import save_image
-from .passes import BATCH, Sampling, render_pass
-from .references import (
+from .renders import (
+    BATCH,
     REFERENCE_SPP,
     TEST_SPP,
+    Sampling,
     UnusableReference,
     as_reference,
     compare_scene,
     load_reference,
+    render_pass,
     variant_for,
 )
 from .report import write_report
@@ -96,9 +98,9 @@ class RenderRegression:
 
         def write() -> None:
             with variant_set(chosen_variant(variant)):
-                sampling, loaded = Sampling.of_spp(reference_spp, batch), load_scene(scene, given, BOX)
-                image = render_pass(loaded, sampling, with_probe=True)
-                save_image(path, as_reference(image, loaded.path, path, sampling, new_limits))
+                loaded = load_scene(scene, given, BOX)
+                image = render_pass(loaded, Sampling.of_spp(reference_spp, batch), with_probe=True)
+                save_image(path, as_reference(image, loaded.path, path, new_limits))
 
         if self.update == "all":
             write()

@@ -1,0 +1,411 @@
+"""Renders of scenes: by passes, here or on a Dask cluster; references, converged renders; and comparisons with these.
+
+A pass renders a share of an image's batches; passes are merged into the image.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import __version__
+from ..llvm import best_variant
+from ..messages import PROGRAM, timed
+from ..variants import set_variant, variant_problem
+from . import RegressionError
+from .compare import Comparison, compare
+from .image import NOTHING, Estimate, Image, Probe, combine, load_image, require_finite
+from .scene import SEEDS, LoadedScene, SceneSource, environment, load_scene, render_pixels
+from .tiers import Status, Tolerances
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+# Samples per pixel of a batch, which is rendered at once with a seed of its own.
+BATCH = 64
+# Fewer batches than these measure the variance badly.
+LEAST_BATCHES = 4
+# Entries of the metadata that all passes of an image share.
+_SHARED = ("variant", "filter", "size", "files", "parameters", "seed", "batch", "total")
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """Which samples make an image: batches of ``batch`` samples per pixel; batch b has the seed ``seed + b``."""
+
+    batches: int
+    batch: int = BATCH
+    seed: int = 0
+
+    @classmethod
+    def of_spp(cls, spp: int, batch: int = BATCH, seed: int = 0) -> Sampling:
+        """At least ``spp`` samples in whole batches, of which there are at least `LEAST_BATCHES`."""
+        batch = min(batch, max(1, spp // LEAST_BATCHES))
+        return cls(max(LEAST_BATCHES, -(-spp // batch)), batch, seed)
+
+    @property
+    def spp(self) -> int:
+        return self.batches * self.batch
+
+    def share(self, number: int, count: int) -> range:
+        """Batches of pass ``number`` of ``count``, where passes count from 1.
+
+        Raises RegressionError if there is no such pass, or more passes than batches.
+        """
+        if not 1 <= number <= count:
+            raise RegressionError(f"there is no pass {number} of {count}; expected 1 to {count}")
+        if count > self.batches:
+            raise RegressionError(
+                f"{self.spp} samples in batches of {self.batch} make {self.batches} batches, fewer than {count} passes"
+            )
+        return range((number - 1) * self.batches // count, number * self.batches // count)
+
+
+def render_pass(
+    loaded: LoadedScene, sampling: Sampling, number: int = 1, count: int = 1, *, with_probe: bool = False
+) -> Image:
+    """Render the batches of one pass; the first also with the first batch alone and the probe, if ``with_probe``."""
+    share = sampling.share(number, count)
+    first: NDArray[np.float32] | None = None
+
+    def batches() -> Iterable[Estimate]:
+        nonlocal first
+        for index in share:
+            at(f"batch {index + 1} of {sampling.batches}")
+            pixels = render_pixels(loaded.scene, (sampling.seed + index) % SEEDS, sampling.batch)
+            if pixels.ndim != 3 or pixels.shape[2] < 3:
+                film = f"the film has the shape {pixels.shape}"
+                raise RegressionError(f'{film}; expected R, G, B: pixel_format "rgb" or "rgba"')
+            pixels = pixels[..., :3]
+            first = pixels if first is None else first
+            yield Estimate.of_batch(pixels, sampling.batch)
+
+    # Rounded as in a file, so that it does not matter whether a pass was written and read again.
+    with timed("Rendering") as at:
+        estimate = combine(batches()).stored()
+    record = {"seed": sampling.seed, "batch": sampling.batch, "batches": [[share.start, share.stop]]}
+    metadata: dict[str, Any] = {
+        "version": __version__,
+        "variant": mi.variant(),
+        "environment": environment(str(mi.variant())),
+        "integrator": str(loaded.scene.integrator()).partition("[")[0],
+        "filter": loaded.filter,
+        "size": list(loaded.size),
+        "files": loaded.files,
+        "parameters": loaded.parameters,
+        "sampling": {**record, "total": sampling.batches, "passes": count},
+    }
+    paired, probe = None, None
+    if with_probe and share.start == 0 and first is not None:
+        paired, probe = first.astype(np.float32).astype(np.float64), probe_scene(loaded)
+        metadata["paired"] = {"seed": sampling.seed, "spp": sampling.batch}
+    name = str(loaded.path or "scene") + (f", pass {number} of {count}" if count > 1 else "")
+    return Image(name, estimate.mean, estimate, paired, probe, metadata)
+
+
+def merge_passes(passes: Sequence[Image], name: str = "merged") -> Image:
+    """Merge passes of one image. The order in which they are given makes no difference.
+
+    Raises RegressionError if a file is no pass, passes are of different images, or two have the same samples.
+    """
+    if not passes:
+        raise RegressionError("no passes to merge; expected at least one")
+    for image in passes:
+        if image.estimate is None or "sampling" not in image.metadata:
+            raise RegressionError(f'"{image.name}" is no pass: it has no variance, or no record of its samples')
+    first, *others = ordered = sorted(passes, key=lambda image: image.metadata["sampling"]["batches"])
+    for other in others:
+        _require_same_image(first, other)
+    ranges = _joined(ordered)
+    estimate = combine(image.estimate for image in ordered if image.estimate is not None).stored()
+    metadata = {**first.metadata, "sampling": {**first.metadata["sampling"], "batches": ranges}}
+    # Only the pass with the first batch can have a paired image and a probe.
+    return Image(name, estimate.mean, estimate, first.paired, first.probe, metadata)
+
+
+def missing_passes(image: Image) -> list[int]:
+    """Numbers of the passes that a merged image lacks, whole or in part."""
+    record = image.metadata["sampling"]
+    present = {index for start, stop in record["batches"] for index in range(start, stop)}
+    total, passes = record.get("total", max(present) + 1), record.get("passes", 1)
+    sampling = Sampling(total, record["batch"], record["seed"])
+    return [i for i in range(1, passes + 1) if not present.issuperset(sampling.share(i, passes))]
+
+
+def _require_same_image(first: Image, other: Image) -> None:
+    entries = [{**image.metadata, **image.metadata["sampling"]} for image in (first, other)]
+    for key in _SHARED:
+        a, b = (of_image.get(key) for of_image in entries)
+        if a != b:
+            difference = f"{key} is {a} and {b}"
+            if isinstance(a, dict) and isinstance(b, dict):
+                names = sorted(name for name in {*a, *b} if a.get(name) != b.get(name))
+                values = [f"{name} is {a.get(name)} and {b.get(name)}" for name in names]
+                # Nobody reads checksums.
+                difference = f"of the {key}, {', '.join(names)} differ" if key == "files" else ", ".join(values)
+            raise RegressionError(f'"{first.name}" and "{other.name}" are not passes of one image: {difference}')
+
+
+def _joined(ordered: Sequence[Image]) -> list[list[int]]:
+    """Ranges of batches, where neighbouring ranges are joined."""
+    joined: list[list[int]] = []
+    ranges = [(*pair, image.name) for image in ordered for pair in image.metadata["sampling"]["batches"]]
+    for start, stop, name in sorted(ranges):
+        if joined and start < joined[-1][1]:
+            raise RegressionError(f'"{name}" has batch {start}, which another pass has as well: it would count twice')
+        if joined and start == joined[-1][1]:
+            joined[-1][1] = stop
+        else:
+            joined.append([start, stop])
+    return joined
+
+
+def probe_scene(loaded: LoadedScene) -> Probe:
+    """The first hits of the rays through the centres of pixels."""
+    width, height = loaded.size
+    # Any, as the stubs are those of variants with arrays.
+    sensor: Any = loaded.sensor
+    scene: Any = loaded.scene
+
+    def first_hit(x: Any, y: Any) -> Any:
+        film_position = mi.Point2f((x + 0.5) / width, (y + 0.5) / height)
+        # The middle of the lens and of the spectrum, when the shutter opens: a probe takes no random samples.
+        ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, film_position, mi.Point2f(0.5))
+        return scene.ray_intersect(ray)
+
+    shapes = scene.shapes()
+    # One hit of arrays; in scalar variants, one for each pixel.
+    if dr.is_jit_v(mi.Float):
+        pixel = dr.arange(mi.UInt32, width * height)
+        hits = [first_hit(mi.Float(pixel % width), mi.Float(pixel // width))]
+        dr.eval(hits)
+        pointers = hits[0].shape, scene.shapes_dr()
+        identity, order = (np.array(dr.reinterpret_array(mi.UInt32, of_shapes)) for of_shapes in pointers)
+    else:
+        hits = [first_hit(x, y) for y, x in np.ndindex(height, width)]
+        identity, order = np.array([id(hit.shape) for hit in hits]), np.array([id(shape) for shape in shapes])
+    values = zip(*((hit.is_valid(), hit.p, hit.sh_frame.n, hit.uv, hit.prim_index) for hit in hits), strict=True)
+    valid, *vectors, triangle = (
+        np.array([np.array(value).T for value in column]).reshape(height, width, -1) for column in values
+    )
+    position, normal, uv = (np.where(valid, vector, 0).astype(np.float32) for vector in vectors)
+    valid, triangle = valid[..., 0], np.where(valid, triangle, NOTHING)[..., 0].astype(np.uint32)
+    # Indices of the shapes, and faces of the cages of those that have one.
+    shape, element = (np.full((height, width), NOTHING, dtype=np.uint32) for _ in range(2))
+    for index, candidate in enumerate(shapes):
+        at = valid & (identity == order[index]).reshape(height, width)
+        shape[at] = index
+        parameters = mi.traverse(candidate) if at.any() and candidate.is_mesh() else {}
+        if "face_element" in parameters:
+            element[at] = np.array(parameters["face_element"]).astype(np.uint32)[triangle[at]]
+    return Probe(position, normal, uv, shape, triangle, element)
+
+
+T = TypeVar("T")
+
+# A worker may have several threads. But Mitsuba has one variant at a time, and an LLVM variant takes all cores.
+_lock = threading.Lock()
+
+
+@contextmanager
+def cluster(address: str) -> Iterator[Client]:
+    """The cluster of a scheduler, at an address such as "tcp://farm:8786".
+
+    Raises RegressionError if `distributed` is not installed, or the cluster is not there.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise RegressionError("Dask is not installed: pip install 'mitsuba-subdivision[dask]'") from None
+    try:
+        client = Client(address, timeout=10)
+    except (OSError, ValueError) as error:
+        raise RegressionError(f'no Dask scheduler at "{address}": {error}') from None
+    with client:
+        if not client.nthreads():
+            raise RegressionError(f'the Dask scheduler at "{address}" has no workers')
+        yield client
+
+
+def results(client: Client, work: Callable[[int], T], variant: str, numbers: Sequence[int]) -> Iterator[tuple[int, T]]:
+    """Numbers and what the workers of a cluster make of them, in the order in which they finish.
+
+    Where a worker ends early, another one repeats its work, one call at a time in each, in a variant of Mitsuba. The
+    work must be picklable.
+    """
+    from distributed import as_completed
+
+    # Not pure, in the sense of Dask: a repeated request renders again.
+    futures = as_completed(client.map(partial(_work, work, variant), numbers, pure=False), with_results=True)
+    return (result for _, result in futures)
+
+
+def _work(work: Callable[[int], T], variant: str, number: int) -> tuple[int, T]:
+    """Runs on a worker."""
+    with _lock:
+        set_variant(variant)
+        return number, work(number)
+
+
+def render_on_cluster(
+    address: str,
+    load: Callable[[], LoadedScene],
+    variant: str,
+    sampling: Sampling,
+    count: int,
+    *,
+    with_probe: bool = False,
+) -> Image:
+    """Render the passes of an image on the workers of a cluster, and merge them.
+
+    With the box filter and an LLVM variant, the image has the same bits as the same passes on one machine, if the
+    workers have that machine's versions and processor. Each loads the scene by ``load``, which must be picklable. A
+    ``count`` of 0 makes as many passes as the workers have threads.
+    """
+    with cluster(address) as client, timed("Rendering on the cluster"):
+        count = count or min(sum(client.nthreads().values()), sampling.batches)
+
+        def work(number: int) -> Image:
+            return render_pass(load(), sampling, number, count, with_probe=with_probe)
+
+        return merge_passes([image for _, image in results(client, work, variant, range(1, count + 1))])
+
+
+# Samples per pixel: four batches for a test, and 64 times as many for a reference.
+TEST_SPP = 256
+REFERENCE_SPP = 16384
+# The seeds of a test are this far from the reference's, so that the samples differ; those of other tests and of second
+# attempts are as far from each other.
+SEED_STEP = 2**20
+# Samples of the second attempt, in samples of the first.
+RETRY_FACTOR = 4
+
+
+def as_reference(
+    image: Image,
+    scene: Path | None,  # The scene's file, if it has one
+    path: str | Path,  # Of the reference, in whose folder the command runs
+    tolerances: Tolerances,
+) -> Image:
+    """Make a reference of an image: its metadata get tolerances, and the command that makes it.
+
+    `save_image` writes the file. Raises RegressionError if the image is not finite.
+    """
+    require_finite(image)
+    limits, made_by = tolerances.as_dict(), image.metadata
+    metadata, sampling = {**made_by, "tolerances": limits}, made_by["sampling"]
+    if scene is not None:
+        # Relative to the reference, so that the working folder makes no difference.
+        metadata["scene"] = Path(os.path.relpath(scene, Path(path).parent)).as_posix()
+        words = [PROGRAM, "render", metadata["scene"], "-o", Path(path).name, "--reference"]
+        values = {"spp": sampling["total"] * sampling["batch"], "batch": sampling["batch"], "seed": sampling["seed"]}
+        words += [word for name, value in values.items() for word in (f"--{name}", str(value))]
+        words += ["--variant", made_by["variant"], *_assignments("-D", made_by["parameters"])]
+        words += _assignments("--tolerance", dict(limits.items() - Tolerances().as_dict().items()))
+        metadata["command"] = shlex.join(words)
+    return replace(image, name=str(path), metadata=metadata)
+
+
+class UnusableReference(RegressionError):
+    """A reference is missing, cannot be read, or is of another scene: it has to be made again."""
+
+
+def load_reference(path: Path) -> Image:
+    """Read a reference. Raises UnusableReference if it is missing, damaged, or no reference."""
+    if not path.is_file():
+        raise UnusableReference(f'there is no reference "{path}"')
+    try:
+        reference = load_image(path)
+    except RegressionError as error:
+        raise UnusableReference(str(error)) from None
+    sampling_of(reference)
+    return reference
+
+
+def sampling_of(reference: Image) -> Sampling:
+    """Sampling of a reference. Raises UnusableReference if the reference does not record it."""
+    sampling = reference.metadata.get("sampling")
+    if reference.estimate is None or not isinstance(sampling, dict):
+        raise UnusableReference(
+            f'"{reference.name}" does not say how it was rendered; expected a reference, as '
+            f'"{PROGRAM} render SCENE -o REFERENCE.exr --reference" writes'
+        )
+    return Sampling(sum(stop - start for start, stop in sampling["batches"]), sampling["batch"], sampling["seed"])
+
+
+def _assignments(option: str, values: Mapping[str, object]) -> list[str]:
+    return [word for name, value in sorted(values.items()) for word in (option, f"{name}={value}")]
+
+
+def variant_for(reference: Image) -> str:
+    """Variant of the reference, or the best that runs here if that one does not."""
+    wanted = reference.metadata.get("variant", "")
+    return best_variant() if variant_problem(wanted) else wanted
+
+
+def render_like(
+    reference: Image, source: SceneSource, spp: int = TEST_SPP, seed: int = 0, *, second_attempt: bool = False
+) -> Image:
+    """Render a scene in the current variant with the settings of a reference.
+
+    The samples are independent of the reference's. The first attempt also has the geometry probe, and repeats the first
+    batch of the reference sample by sample, for the paired tier.
+    Each ``seed`` from 0 on has other samples, as has the second attempt with each.
+
+    Raises UnusableReference if the reference does not say how it was rendered, or has another size.
+    """
+    sampling = sampling_of(reference)
+    loaded = load_scene(source, reference.metadata.get("parameters"), reference.metadata.get("filter"))
+    if loaded.size != reference.size:
+        sizes = ["{} x {}".format(*size) for size in (loaded.size, reference.size)]
+        raise UnusableReference(f'the scene has {sizes[0]} pixels, the reference "{reference.name}" has {sizes[1]}')
+    first_seed = (sampling.seed + SEED_STEP * (2 * seed + 1 + second_attempt)) % SEEDS
+    test = render_pass(loaded, Sampling.of_spp(spp, sampling.batch, first_seed))
+    if second_attempt or reference.paired is None:
+        return test
+    pair = render_pass(loaded, Sampling(1, sampling.batch, sampling.seed), with_probe=True)
+    metadata = {**test.metadata, "paired": pair.metadata["paired"]}
+    return replace(test, paired=pair.paired, probe=pair.probe, metadata=metadata)
+
+
+def compare_scene(
+    reference: Image,
+    source: SceneSource,
+    tiers: Sequence[str] | None = None,
+    spp: int = TEST_SPP,
+    tolerances: Tolerances | None = None,
+    suite_size: int = 1,
+    seed: int = 0,
+) -> Comparison:
+    """Render a scene as its reference was, in the current variant, and compare the two.
+
+    Where only the tile tier fails, chance may be the reason. A second attempt with new samples, four times as many,
+    then decides.
+
+    Tiers, tolerances and suite size are as in `compare`, the seed as in `render_like`. The samples are rounded up to
+    whole batches, of the reference's size or less.
+    """
+    test = render_like(reference, source, spp, seed)
+    comparison = compare(reference, test, tiers, tolerances, suite_size)
+    failed = [tier for tier in comparison.tiers if tier.status is Status.FAIL]
+    if [tier.name for tier in failed] != ["tile"] or test.estimate is None:
+        return comparison
+    again = render_like(reference, source, RETRY_FACTOR * int(test.estimate.count.max()), seed, second_attempt=True)
+    test = replace(test, pixels=again.pixels, estimate=again.estimate, metadata={**test.metadata, "attempt": 2})
+    comparison = compare(reference, test, tiers, tolerances, suite_size)
+    comparison.notes.append(
+        f"second attempt of the tile tier, with {RETRY_FACTOR} times the samples; the first found: {failed[0].lines[0]}"
+    )
+    return comparison
