@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.contents import Attribute
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary
+from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.schemes import scheme_named
-from patches.closed_cages import bipyramid, extraordinary_triangles, prism, torus
+from patches.closed_cages import bipyramid, prism, torus
 from peers.fidelity_cages import MODES, fan
-from reference.refined_cages import channel_of, half_disc, sheet, tagged
+from reference.refined_cages import channel_of, half_disc, tagged
 from reference.refinement import refined
 
 INFINITE = 10.0
@@ -176,55 +176,6 @@ def test_without_seams_values_are_subdivided_as_points_are(scheme, cage, np_rng)
             for name in attributes:
                 np.testing.assert_array_equal(surface.evaluate_attribute(name, *places), expected)
                 assert surface.channel(name).layout.patches is surface.patches
-
-
-@pytest.mark.parametrize("triangles", [False, True])
-@pytest.mark.parametrize("mode", MODES[1:])
-def test_flat_islands_keep_their_coordinates(triangles, mode, np_rng):
-    cage = sheet(4, 4, triangles=triangles)
-    t = cage.topology
-    # Two islands side by side, the second one turned and moved. Where two triangles make a corner, tags make it sharp.
-    middle = np.bincount(t.face, cage.positions[cage.face_vertices, 0]) / t.face_sizes
-    island = (middle > 2)[t.face]
-    corners = [(vertex, INFINITE) for vertex in (0, 2, 4, 20, 22, 24)] if triangles else []
-
-    def moved(flat):
-        return flat @ [[0, 2], [-2, 0]] + [5, 7]
-
-    flat = cage.positions[:, :2]
-    values = face_varying(np.concatenate([flat, moved(flat)]), cage.face_vertices + island * cage.vertex_count)
-    given = tagged(cage, corners=corners, face_varying=mode, texcoords=values)
-    surface = LimitSurface(given, "loop" if triangles else "catmull_clark")
-    element, uv, corner = random_locations(surface, np_rng)
-    values_here = surface.evaluate_attribute("texcoords", element, uv, corner)
-    start = t.face_offsets[element] + corner
-    origin, u, v = (flat[cage.face_vertices[h]] for h in (start, t.next[start], t.prev[start]))
-    at = origin + uv[:, :1] * (u - origin) + uv[:, 1:] * (v - origin)
-    expected = np.where(island[start][:, None], moved(at), at)
-    np.testing.assert_allclose(values_here, expected, rtol=0, atol=20 * ROUNDING)
-
-
-@pytest.mark.parametrize("method", ["uniform", "chaikin"])
-@pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
-def test_an_island_is_the_surface_of_its_own_faces(scheme, method, np_rng):
-    cage = extraordinary(5) if scheme == "catmull_clark" else extraordinary_triangles(5)
-    t = cage.topology
-    is_low = np.bincount(t.face, cage.positions[cage.face_vertices, 2]) / t.face_sizes < 0.5
-    inside = is_low[t.face]
-    # Semi-sharp edges of one side, up to the seam; on the other side nothing is sharp.
-    half_edges = t.edge_half_edge[(np_rng.random(t.edge_count) < 0.3) & (inside & inside[t.twin])[t.edge_half_edge]]
-    creases = creases_along(cage, half_edges, np_rng, [0.5, 1, 1.75])
-    values = face_varying(np.tile(cage.positions, (2, 1)), cage.face_vertices + inside * cage.vertex_count)
-    options = {"face_varying": "corners_only", "attributes": {"p": values}}
-    surface = LimitSurface(tagged(cage, creases=creases, crease_method=method, **options), scheme)
-    faces = np.flatnonzero(is_low)
-    kept, vertices = np.unique(cage.face_vertices[inside], return_inverse=True)
-    own = [(*np.searchsorted(kept, ends), sharpness) for *ends, sharpness in creases]
-    arrays = cage.positions[kept], cage.face_sizes[faces], vertices.ravel()
-    alone = LimitSurface(ControlCage.from_arrays(*arrays, creases=own, crease_method=method), scheme)
-    element, uv, corner = random_locations(alone, np_rng)
-    values_here = surface.evaluate_attribute("p", faces[element], uv, corner)
-    np.testing.assert_allclose(values_here, alone.evaluate(element, uv, corner).p, rtol=0, atol=2 * ROUNDING)
 
 
 # Modes do not choose seams, but how values move there, if at all.

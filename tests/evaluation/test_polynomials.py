@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from evaluation.common import EVERY_SCHEME_OBJECT, inside
 from mitsuba_subdivision import SchemeError
-from mitsuba_subdivision.evaluation.polynomials import polynomial_basis, times
+from mitsuba_subdivision.evaluation.polynomials import polynomial_basis
 from mitsuba_subdivision.schemes import CatmullClark
 
 pytestmark = pytest.mark.core
@@ -45,19 +45,6 @@ def test_bernstein_form_and_its_halves_are_the_same_polynomials_and_bound_them(s
     assert of_controls.min() >= 0
     for child, halved in zip(scheme.domain.children, basis.halves, strict=True):
         np.testing.assert_allclose(values @ halved, basis.values(child.inverse()(uv)), rtol=0, atol=BERNSTEIN)
-
-
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("count", [0, 1, 100])
-def test_products_do_not_depend_on_the_blocks_they_are_made_in(dtype, count, np_rng, monkeypatch):
-    rows, points = np_rng.normal(size=(5, 9)).astype(dtype), np_rng.normal(size=(9, 3, count)).astype(dtype)
-    expected = np.einsum("rb,bxn->rxn", rows, points)
-    for most in (1, rows.size * 10, 1 << 18):
-        monkeypatch.setattr("mitsuba_subdivision.evaluation.equations.MOST_MULTIPLICATIONS", most)
-        products = times(rows, points)
-        assert products.dtype == dtype
-        # Sums of nine products.
-        np.testing.assert_allclose(products, expected, rtol=0, atol=100 * np.finfo(dtype).eps)
 
 
 class Bent(CatmullClark):

@@ -224,19 +224,6 @@ def test_every_scheme_takes_fans_that_share_a_vertex(scheme):
         assert surface.patches.patch_count == 1 + 5
 
 
-@pytest.mark.parametrize("interpolation", ["vertex", "varying", "face_varying"])
-def test_data_that_is_linear_in_space_stays_so(interpolation):
-    # Affine invariance, of points and values alike; on the surface for values that follow it.
-    cage = book(4)
-    indices = cage.face_vertices if interpolation == "face_varying" else None
-    data = msub.Attribute(cage.positions[:, :2], interpolation, indices)
-    tessellation = msub.LimitSurface(changed(cage, attributes={"place": data}, face_varying="none")).tessellate(4)
-    places = tessellation.attributes["place"]
-    assert np.isfinite(places).all()
-    if interpolation != "varying":
-        np.testing.assert_allclose(places, tessellation.positions[:, :2], atol=1e-14)
-
-
 @pytest.mark.parametrize(
     ("triangles", "mode"),
     [

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from kernels.surfaces import KINDS, grid_locations, surface_named
 from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.cage.named_cages import cube, extraordinary
+from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.patches import closest_points
 from mitsuba_subdivision.patches.closest_points import BoxTree
 from mitsuba_subdivision.patches.nearest_in_piece import TurnedBoxes, nearest_in_pieces
@@ -111,28 +111,16 @@ def test_nearest_points_of_a_flat_sheet_are_projections():
     np.testing.assert_allclose(nearest.n, [[0, 0, 1]] * 5, rtol=0, atol=1e-14)
 
 
-@pytest.mark.core
-@pytest.mark.parametrize("valence", [3, 7])
-def test_extraordinary_points_are_found(valence):
-    """On the axis of a dome the nearest point is the pole, at every distance."""
-    surface = LimitSurface(extraordinary(valence))
-    pole = surface.evaluate(0, [[0.0, 0.0]])
-    heights = np.array([0.0, 1e-12, 1e-6, 0.01, 1.0, 30.0])
-    nearest = surface.closest_point(pole.p + heights[:, None] * pole.n)
-    np.testing.assert_allclose(nearest.distance, heights, rtol=0, atol=ROUNDED)
-    # Where the point is far away, a place beside the pole is as far, but for rounding of the squared distance.
-    np.testing.assert_allclose(nearest.p[:5], np.repeat(pole.p, 5, axis=0), rtol=0, atol=1e-7)
-
-
 @pytest.mark.parametrize("name", ["valence 3", "valence 50", "dart", "loop valence 3", "doo_sabin mixed torus"])
-def test_points_above_places_next_to_extraordinary_ones(name, np_rng):
+def test_points_above_places_at_and_next_to_extraordinary_ones(name, np_rng):
     surface = surface_named(name)
-    deep = np.repeat([2.0**-8, 2.0**-20, 2.0**-40], 3)[:, None]
+    deep = np.repeat([2.0**-8, 2.0**-20, 2.0**-40, 0], 3)[:, None]
     domain = surface.scheme.domain
     uv = deep * (np_rng.dirichlet(np.ones(domain.corner_count), len(deep)) @ domain.corners)
     element = 0 if surface.scheme.element == "face" else int(np.argmax(surface.patches.elements.face_sizes != 4))
     samples = surface.evaluate(element, uv)
-    assert (surface.closest_point(samples.p + 1e-3 * samples.n).distance <= 1e-3 + ROUNDED).all()
+    for height in (0.0, 1e-12, 1e-6, 1e-3):
+        assert (surface.closest_point(samples.p + height * samples.n).distance <= height + ROUNDED).all()
 
 
 def test_creases_are_found(np_rng):
@@ -142,16 +130,6 @@ def test_creases_are_found(np_rng):
     points[:10, 1] = np_rng.uniform(-1, 1, 10)
     nearest = LimitSurface(creased(cube())).closest_point(points)
     np.testing.assert_allclose(nearest.p, np.clip(points, -1, 1), rtol=0, atol=1e-13)
-
-
-@pytest.mark.parametrize("name", ["mixed torus", "semi-sharp ring", "loop mixed torus"])
-@pytest.mark.parametrize("constant", ["MOST_KEPT", "MOST_HALVED"])
-def test_levels_that_are_computed_when_needed_change_nothing(name, constant, np_rng, monkeypatch):
-    surface, points = surface_named(name), np_rng.uniform(-1.5, 3, (100, 3))
-    expected = surface.closest_point(points)
-    monkeypatch.setattr(closest_points, constant, 0)
-    later = LimitSurface(surface.cage, surface.scheme)
-    np.testing.assert_allclose(later.closest_point(points).distance, expected.distance, rtol=0, atol=1e-13)
 
 
 def points_of_pieces(pieces, which, uv):

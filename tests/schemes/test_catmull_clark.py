@@ -22,7 +22,6 @@ OPEN = {
 }
 MESHES = {name: make().topology for name, make in CLOSED_CAGES.items()} | OPEN
 EVERY_MESH = pytest.mark.parametrize("topology", MESHES.values(), ids=MESHES)
-EVERY_OPEN_MESH = pytest.mark.parametrize("topology", OPEN.values(), ids=OPEN)
 
 
 def random_points(count, seed=3):
@@ -52,23 +51,6 @@ def test_refinement_follows_the_rules(topology):
     inner = sorted({*keys} - on_border)
     expected = np.array([point(keys[i]) for i in inner], dtype=float).reshape(-1, 3)
     np.testing.assert_allclose(refined[inner], expected, rtol=0, atol=ROUNDING)
-
-
-@EVERY_OPEN_MESH
-def test_border_vertices_move_along_the_border_only(topology):
-    points = random_points(topology.vertex_count)
-    refined = SCHEME.refine(topology).apply(points)
-    border = np.flatnonzero(topology.twin < 0)
-    ends = topology.face_vertices[np.stack([border, topology.next[border]], axis=1)]
-    for vertex in np.unique(ends):
-        a, b = ends[(ends == vertex).any(axis=1)].sum(axis=1) - vertex
-        expected = (6 * points[vertex] + points[a] + points[b]) / 8
-        np.testing.assert_allclose(refined[vertex], expected, rtol=0, atol=ROUNDING)
-    on_border = refined[topology.vertex_count + topology.edge[border]]
-    np.testing.assert_allclose(on_border, points[ends].mean(axis=1), rtol=0, atol=ROUNDING)
-    # So does a vertex without a face: it stays.
-    alone = topology.vertex_face_count == 0
-    np.testing.assert_array_equal(refined[: len(points)][alone], points[alone])
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

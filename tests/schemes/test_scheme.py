@@ -9,9 +9,6 @@ from reference.exact_samples import mesh_of
 
 pytestmark = pytest.mark.core
 
-# Sums of up to 16 products of numbers of a size of some units.
-ROUNDED = 1e-14
-
 
 def test_a_scheme_with_other_rules_is_a_copy():
     usual = scheme_named("catmull_clark")
@@ -33,19 +30,6 @@ def test_a_scheme_with_other_rules_is_a_copy():
 def test_rules_that_a_scheme_does_not_know_are_refused(scheme, crease_method, triangle_rule, missing):
     with pytest.raises(SchemeError, match=f"the scheme {scheme} has no {missing}"):
         with_rules(scheme_named(scheme), crease_method, triangle_rule)
-
-
-@pytest.mark.parametrize("name", ["catmull_clark", "doo_sabin", "loop"])
-def test_regular_patches_reproduce_constant_and_linear_functions(name):
-    """Values at the lattice's points, and derivatives; up to where parameters begin."""
-    scheme = scheme_named(name)
-    uv, _ = scheme.domain.quadrature(5)
-    weights = scheme.regular_basis(uv, 2)
-    constant, linear = weights.sum(axis=2), weights @ scheme.regular_lattice
-    np.testing.assert_allclose(constant, [[1.0]] + 5 * [[0.0]] + np.zeros(len(uv)), rtol=0, atol=ROUNDED)
-    np.testing.assert_allclose(linear[0] - uv, np.broadcast_to(linear[0, 0] - uv[0], uv.shape), rtol=0, atol=ROUNDED)
-    for row, expected in zip(linear[1:], ([1, 0], [0, 1], [0, 0], [0, 0], [0, 0]), strict=True):
-        np.testing.assert_allclose(row, np.broadcast_to(expected, uv.shape), rtol=0, atol=ROUNDED)
 
 
 # Back to back: every vertex has valence 2, and edges that cut off a corner have the same ends on both sides.

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from kernels.surfaces import random_locations, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
 from patches.closed_cages import bumpy, mixed_torus
 from reference.refined_cages import refine_first, tagged
 
@@ -64,3 +66,38 @@ def test_cages_that_are_refined_first_have_the_same_surface(np_rng, monkeypatch)
     np.testing.assert_allclose(boxes, others, rtol=0, atol=BOXES * size)
     samples, (lower, upper) = refined.sample(2000), boxes
     assert ((lower[samples.element] <= samples.p) & (samples.p <= upper[samples.element])).all()
+
+
+BLOCKS = {
+    "mesh.ragged.CHUNK_LENGTH": 5,
+    "patches.patch_samples.WEIGHTS": 70,
+    "evaluation.equations.MOST_MULTIPLICATIONS": 1,
+    "tessellation.vertex_table.WEIGHTS_AT_ONCE": 1,
+    "tessellation.vertex_table.COEFFICIENTS_AT_ONCE": 1,
+    "tessellation.adaptive.TILES_AT_ONCE": 7,
+    # Levels that are computed when they are needed.
+    "patches.closest_points.MOST_KEPT": 0,
+    "patches.closest_points.MOST_HALVED": 0,
+}
+
+
+@pytest.mark.parametrize("name", ["mixed torus", "loop corner", "semi-sharp ring"])
+def test_blocks_that_bound_memory_do_not_show(name, np_rng, monkeypatch):
+    named = surface_named(name)
+    where, points = random_locations(named, np_rng, 200), np_rng.uniform(-1.5, 3, (50, 3))
+    criterion = Criterion(Measure.CHORD, 1e-2 * np.linalg.norm(np.ptp(named.cage.positions, axis=0)))
+
+    def results():
+        # Tables of its own: a surface keeps what it has made.
+        surface = LimitSurface(named.cage, named.scheme)
+        for table in (surface.sampling(3), surface.adaptive_sampling(criterion)):
+            yield from (table.triangles, table.element, *table.locations(), *table.apply(named.cage.positions))
+        for dtype in (np.float64, np.float32):
+            yield from surface.evaluate(*where, dtype=dtype)[:4]
+        yield surface.closest_point(points).distance
+
+    expected = list(results())
+    for constant, value in BLOCKS.items():
+        monkeypatch.setattr(f"mitsuba_subdivision.{constant}", value)
+    for values, whole in zip(results(), expected, strict=True):
+        np.testing.assert_allclose(values, whole, rtol=0, atol=1e-13 if whole.dtype == np.float64 else 1e-6)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import CageError, ControlCage, LimitSurface
 from mitsuba_subdivision.mesh.signature import NEAR_FACES
-from mitsuba_subdivision.patches import patch_samples
 from mitsuba_subdivision.schemes import CatmullClark, Loop
 from mitsuba_subdivision.surface import arguments
 
@@ -62,16 +61,6 @@ def test_valences_at_the_limit_are_evaluated(scheme, tags):
     samples = LimitSurface(pyramid(count, **tags), scheme).evaluate([3, 3, 3], [[0, 0], [1e-9, 2e-9], [0.2, 0.3]])
     assert np.isfinite(samples.n).all()
     np.testing.assert_allclose(np.linalg.norm(samples.n, axis=1), 1, rtol=0, atol=ROUNDED)
-
-
-def test_samples_on_a_fan_are_those_of_its_faces_one_after_the_other(monkeypatch, np_rng):
-    cage = pyramid(60, creases=[[60, 0, 2.5], [60, 7, 1.5]])
-    element, uv = np.repeat(np.arange(60), 5), np_rng.random((300, 2))
-    together = LimitSurface(cage, "catmull_clark").evaluate(element, uv)
-    monkeypatch.setattr(patch_samples, "WEIGHTS", 1)
-    apart = LimitSurface(cage, "catmull_clark").evaluate(element, uv)
-    np.testing.assert_allclose(apart.p, together.p, rtol=0, atol=ROUNDED_POINT)
-    np.testing.assert_allclose(apart.n, together.n, rtol=0, atol=ROUNDED_NORMAL)
 
 
 @SCHEMES

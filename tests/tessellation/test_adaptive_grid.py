@@ -9,7 +9,6 @@ from kernels.surfaces import KINDS, SURFACES, surface_named
 from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.mesh import ragged
 from mitsuba_subdivision.tessellation import adaptive
 from mitsuba_subdivision.tessellation.adaptive_grid import PatchFrames
 from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
@@ -242,22 +241,6 @@ def test_tiles_do_not_depend_on_the_blocks_that_bound_their_memory(monkeypatch):
     np.testing.assert_array_equal(table_of(surface, 1e-2, 64).triangles, whole)
     assert max(sizes) == most
     assert sum(sizes) == surface.patches.patch_count
-
-
-def test_tessellations_do_not_depend_on_the_chunks_that_fit_a_cache(monkeypatch):
-    named = surface_named("mixed torus")
-    tables = []
-    for length in (ragged.CHUNK_LENGTH, 5):
-        monkeypatch.setattr(ragged, "CHUNK_LENGTH", length)
-        # Tables of its own: a surface keeps what it has made.
-        surface = LimitSurface(named.cage, named.scheme)
-        adaptive, uniform = table_of(surface, 1e-2), surface.sampling(3)
-        vertices = *adaptive.apply(named.cage.positions), *uniform.apply(named.cage.positions)
-        places = *adaptive.locations(), *adaptive.grid.triangle_locations
-        tables.append([adaptive.triangles, adaptive.element, uniform.triangles, *vertices, *places])
-    assert len(tables[0][0]) > 100
-    for whole, cut in zip(*tables, strict=True):
-        np.testing.assert_array_equal(whole, cut)
 
 
 def test_too_many_triangles_are_refused_before_most_tiles_are_looked_at(monkeypatch):

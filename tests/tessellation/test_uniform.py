@@ -3,7 +3,7 @@ import pytest
 from kernels.surfaces import SURFACES, surface_named
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage import CageWarning, named_cages
-from patches.closed_cages import bumpy, cage_of, mixed_torus
+from patches.closed_cages import bumpy, cage_of
 
 pytestmark = pytest.mark.core
 
@@ -97,18 +97,6 @@ def test_normals_are_numbers_where_sums_overflow(surface):
         normals = surface.sampling(3).apply(surface.cage.positions * 3e307)[1]
     lengths = np.linalg.norm(normals, axis=1)
     np.testing.assert_allclose(lengths[lengths > 0], 1, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("coefficients", [1, 1000])
-@pytest.mark.parametrize("weights", [1, 5000])
-def test_runs_do_not_show(weights, coefficients, monkeypatch):
-    surface = LimitSurface(bumpy(mixed_torus(), size=0.05))
-    table = surface.sampling(3)
-    expected = table.apply(surface.cage.positions)
-    for name, value in (("WEIGHTS_AT_ONCE", weights), ("COEFFICIENTS_AT_ONCE", coefficients)):
-        monkeypatch.setattr(f"mitsuba_subdivision.tessellation.vertex_table.{name}", value)
-    for values, one in zip(table.apply(surface.cage.positions), expected, strict=True):
-        np.testing.assert_allclose(values, one, rtol=0, atol=ROUNDING)
 
 
 def test_more_vertices_than_buffers_hold_are_refused():
