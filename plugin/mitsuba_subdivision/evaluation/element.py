@@ -233,9 +233,8 @@ def irregular_curvature(
     """Compute curvatures in an irregular patch, in the frame of its limit normal.
 
     Near the extraordinary point second derivatives are almost tangential, and their small normal part is lost to
-    rounding. So coordinates in the limit tangent plane and heights over it are summed separately. Coordinates scale
-    with powers of λ_2. Heights scale with powers of λ_4, as the eigenvectors of λ_2 and λ_3 have no height. Every term
-    of the second fundamental form has one height as a factor, so the power of λ_4 can be factored out.
+    rounding. So coordinates in the limit tangent plane and heights over it are summed separately, with powers of λ_2
+    and λ_4, see section 9 of plugin/MATHEMATICS.md.
 
     Returns (2, s): Gaussian and mean. At the extraordinary point itself 0 where the curvature vanishes there, else NaN.
     """

@@ -163,15 +163,8 @@ def uneven_frame(
 ) -> FloatArray:
     """Compute the frame at a finite level, where the second eigenvalue is larger than the third, as on borders.
 
-    Let g_u and g_v be the coefficients of the second eigenvector in S_u and S_v. The frame is::
-
-        g_u S_u + g_v S_v    along the direction that contracts slowest
-        g_u S_v - g_v S_u    without that direction
-
-    Its cross product is ``(g_u² + g_v²)`` times that of the derivatives. Each tangent is divided by the power of its
-    largest eigenvalue, so that both keep their magnitude at every level.
-
-    Returns (2, s, K).
+    Returns (2, s, K): ``g_u S_u + g_v S_v`` and ``g_u S_v - g_v S_u`` with the coefficients g of the second eigenvector
+    in the derivatives, each divided by the power of its largest eigenvalue, see section 10 of plugin/MATHEMATICS.md.
     """
     by_u, by_v = tangents
     g_u, g_v = by_u[:, 1:2], by_v[:, 1:2]

@@ -20,7 +20,6 @@ from scipy.sparse.linalg import splu
 from ..cage import ControlCage
 from ..device_arrays import upload
 from ..kernels.linear_maps import SparseMatrix, attached
-from ..mesh.connectivity import IntArray, Topology
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 
@@ -152,7 +151,11 @@ def folds(cage: ControlCage) -> Callable[[dr.ArrayBase], mi.Float]:
     """
     t = cage.topology
     half_edges = np.flatnonzero(t.twin > np.arange(t.half_edge_count))
-    sides = [_quadrilaterals(t, side) for side in (half_edges, t.twin[half_edges])]
+    # For the faces of each edge, vertices around it: one before it, the ends, and one after it, maybe the first one.
+    sides = [
+        [upload(mi.UInt32, t.face_vertices[corners]) for corners in (t.prev[h], h, t.next[h], t.next[t.next[h]])]
+        for h in (half_edges, t.twin[half_edges])
+    ]
 
     def energy(points: dr.ArrayBase) -> mi.Float:
         if not len(half_edges):
@@ -161,12 +164,6 @@ def folds(cage: ControlCage) -> Callable[[dr.ArrayBase], mi.Float]:
         return dr.sum(dr.square(dr.maximum(LEAST_COSINE - cosine, 0))) / len(half_edges)
 
     return energy
-
-
-def _quadrilaterals(t: Topology, half_edges: IntArray) -> list[mi.UInt32]:
-    """Vertices of a face around its edge: one before it, the ends, and one after it, which may be the first one."""
-    corners = t.prev[half_edges], half_edges, t.next[half_edges], t.next[t.next[half_edges]]
-    return [upload(mi.UInt32, t.face_vertices[half_edge]) for half_edge in corners]
 
 
 def _normals(points: dr.ArrayBase, corners: list[mi.UInt32]) -> mi.Normal3f:

@@ -32,8 +32,6 @@ if TYPE_CHECKING:
 TAIL, MOST_LEVELS = 2.0**-20, 64
 # Numbers per run of patches, which bounds temporary memory.
 CHUNK = 1 << 21
-# Order of the derivatives whose squares an energy integrates.
-FIRST, SECOND = 1, 2
 
 # Maps derivatives by u, v, uu, uv and vv of the basis functions (5, S, K) and of points (5, P, S, 3) to (P, S, m, K): m
 # derivatives of the basis functions along the surface, times the square root of the area element.
@@ -54,11 +52,10 @@ def energy_matrix(
     table = patches if patches.refined is None else patches.refined.table
     points = control_points if refinement is None else refinement @ control_points
     total = sparse.csr_array((len(points), len(points)))
-    derivative = FIRST if density is gradients else SECOND
     for patch_class in counted(table.classes, "Energies of patch classes"):
         first, shape = patch_class.first_control, patch_class.controls.shape
         class_controls = controls[first : first + patch_class.controls.size].reshape(shape[::-1]).T.astype(np.int32)
-        basis, weights = _basis_derivatives(table.scheme, patch_class.signature, derivative, order)
+        basis, weights = _basis_derivatives(table.scheme, patch_class.signature, density, order)
         run_length = max(1, CHUNK // (3 * basis[0].size))
         for entries in np.split(class_controls, range(run_length, len(class_controls), run_length)):
             relative = points[entries] - points[entries[:, :1]]
@@ -74,7 +71,7 @@ def energy_matrix(
 
 
 def _basis_derivatives(
-    scheme: Scheme, signature: Signature, derivative: int, order: int
+    scheme: Scheme, signature: Signature, density: Density, order: int
 ) -> tuple[FloatArray, FloatArray]:
     """Derivatives ``(5, S, K)`` of a patch's basis functions at the nodes of all pieces, and weights ``(S,)``.
 
@@ -83,7 +80,7 @@ def _basis_derivatives(
     form, (element,) = polynomial_basis(scheme), patch_trees(scheme, [signature])
     coefficients = [element.coefficients(form.of_controls)]
     for tip in element.tips:
-        for level in range(_level_count(tip.irregular_patch, derivative)):
+        for level in range(_level_count(tip.irregular_patch, density)):
             # The first eigenfunction is constant, and has no derivatives.
             coefficients.append(level_rows(tip.irregular_patch, level)[:, :, 1:] @ tip.coordinates[1:])
     uv, weights = form.bernstein.domain.quadrature(order)
@@ -92,7 +89,7 @@ def _basis_derivatives(
     return derivatives.reshape(5, -1, joined.shape[2]), np.tile(weights, len(joined))
 
 
-def _level_count(patch: IrregularPatch, derivative: int) -> int:
+def _level_count(patch: IrregularPatch, density: Density) -> int:
     """Number of levels around an extraordinary point over which an energy is summed.
 
     From level to level, areas scale with the product of the second and third eigenvalues, and so does the energy of
@@ -101,7 +98,7 @@ def _level_count(patch: IrregularPatch, derivative: int) -> int:
     summed.
     """
     _, second, third, fourth, *_ = patch.basis.moduli
-    ratio = second * third if derivative == FIRST else (fourth / third**2) ** 2 * second * third
+    ratio = second * third if density is gradients else (fourth / third**2) ** 2 * second * third
     # Up to rounding: at one, every level has the same energy.
     return min(int(np.ceil(np.log(TAIL) / np.log(ratio))), MOST_LEVELS) if ratio < 1 - CLUSTER_WIDTH else 1
 
