@@ -10,7 +10,6 @@ out.
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
 # Before Mitsuba, so that Dr.Jit finds an LLVM library that works.
 import mitsuba_subdivision
@@ -18,8 +17,9 @@ import mitsuba_subdivision
 # isort: split
 import mitsuba as mi
 import numpy as np
+from kernels.surfaces import CAGES
+from shapes.scenes import camera_rays, scene_with
 
-CAGES = Path(__file__).resolve().parents[1] / "scenes" / "cages"
 CAMERAS = {
     "human": ([0, -12, 8], [0, 0, 4]),
     "rook": ([4, -6, 4], [0, 0, 1.2]),
@@ -54,12 +54,8 @@ def main() -> None:
 def hits(name: str, rate: int, shading: str, resolution: int) -> dict[str, np.ndarray]:
     """What the rays hit: whether they do, points, normals and the rays' directions."""
     origin, target = CAMERAS[name]
-    to_world = mi.ScalarTransform4f().look_at(origin, target, [0, 0, 1])
     shape = {"type": "subdivision", "filename": str(CAGES / f"{name}.obj"), "tessellation_rate": rate}
-    sensor = {"type": "perspective", "to_world": to_world, "fov": 30}
-    scene = mi.load_dict({"type": "scene", "sensor": sensor, "shape": {**shape, "shading": shading}})
-    y, x = (np.indices((resolution, resolution)).reshape(2, -1) + 0.5) / resolution
-    ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, mi.Point2f(x, y), mi.Point2f(0.5))
+    scene, ray = scene_with(shape={**shape, "shading": shading}), camera_rays(resolution, origin, target)
     si = scene.ray_intersect(ray)
     box = scene.bbox()
     values = {"p": si.p, "n": si.sh_frame.n, "d": ray.d, "hit": si.is_valid(), "size": box.max - box.min}

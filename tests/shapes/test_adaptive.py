@@ -1,6 +1,5 @@
 """The shape with an adaptive tessellation: its parameters, its buffers, its pictures."""
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -9,12 +8,10 @@ from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.shapes.parameters import sensor_in_world
 from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
 from patches.closed_cages import bumpy
-from reference.refined_cages import tagged
 from shapes.cages import cube, load
-from shapes.scenes import SINGLE, all_directions, buffer, film, perspective, rays, scene_with, vertices
+from shapes.scenes import SINGLE, buffer, film, perspective, vertices
 from shapes.updates import update
 from shapes.variants import every_variant, llvm, scalar
-from tessellation.test_attribute_table import with_seams
 
 ADAPTIVE = {"tessellation": "adaptive", "max_rate": 32}
 CHORD = Criterion(Measure.CHORD, 1e-2)
@@ -114,17 +111,6 @@ def test_pixel_errors_are_seen_from_the_sensor(sensor):
     largest = (LimitSurface(CAGE).closest_point(points).distance / pixel).max()
     # And not much nearer anywhere: a fourth of the triangles would not do.
     assert 0.1 < largest < 0.5 + PIXEL
-
-
-@llvm
-def test_not_one_ray_escapes(np_rng):
-    """From the middle of a closed creased cage with seams and polygons."""
-    cage = with_seams(bumpy(named_cages.extraordinary(7)), np_rng)
-    cage = tagged(cage, texcoords=cage.texcoords, creases=cage.tags.creases(cage.topology))
-    error, outwards = pixel_error_for(mi.load_dict(view((96, 96), fov=6)), 0.2), all_directions(768)
-    shape = load(cage, **error)
-    assert shape.vertex_count() > 1000
-    assert dr.all(scene_with(shape=shape).ray_test(rays(0 * outwards, outwards)))
 
 
 @scalar

@@ -10,7 +10,7 @@ from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from patches.closed_cages import cube_with_hexagon, extraordinary_triangles, tetrahedron
 from reference.refined_cages import sheet
 from scipy import ndimage
-from shapes.cages import RING, cube, described, textured
+from shapes.cages import RING, bitmap, cube, described, textured
 from shapes.scenes import camera_rays, perspective, rays, rows, scene_with
 from shapes.variants import llvm
 
@@ -260,9 +260,7 @@ def checkerboard():
 def waves(channels):
     y, x = np.indices((32, 32)) / 32
     heights = 0.5 + 0.2 * np.sin(2 * np.pi * x) * np.cos(2 * np.pi * y)
-    values = np.stack([heights, 1 - heights, 0 * x + 1], axis=-1)[..., :channels]
-    bitmap = mi.Bitmap(np.ascontiguousarray(values, dtype=np.float32))
-    return {"type": "bitmap", "bitmap": bitmap, "raw": True}
+    return bitmap(np.stack([heights, 1 - heights, 0 * x + 1], axis=-1)[..., :channels])
 
 
 def metal(**parameters):
@@ -329,31 +327,22 @@ def test_materials_look_the_same_at_every_rate():
         assert (apart > 0.1).mean() < 0.02, name
 
 
-def light():
-    return {"type": "area", "radiance": rgb(1, 1, 1)}
-
-
-def floor(**more):
-    to_world = mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(3)
-    return {"type": "rectangle", "to_world": to_world, **more}
-
-
-DARK = {"type": "constant", "radiance": 1e-6}
-
-
 def test_emitters_light_a_floor_whichever_strategy_finds_them():
     """Emitters are sampled on triangles; what hits them counts with the weight of that place and normal."""
+    below, dark = mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(3), {"type": "constant", "radiance": 1e-6}
+    floor, emitter = {"type": "rectangle", "to_world": below}, {"type": "area", "radiance": rgb(1, 1, 1)}
     view = {"origin": (0, -4, 3), "target": (0, 0, -1)}
-    coarse, fine = images((8, 16), cube(), {"emitter": light()}, light=DARK, view=view, spp=256, floor=floor())
+    coarse, fine = images((8, 16), cube(), {"emitter": emitter}, light=dark, view=view, spp=256, floor=floor)
     assert coarse.mean() == pytest.approx(fine.mean(), rel=ENERGY)
-    shape = make(cube(), tessellation_rate=1, emitter=light())
-    view, rough = {"origin": (0, -4, 1), "target": (0, 0, -1.2), "fov": 12}, {"type": "roughconductor", "alpha": 0.3}
+    shape = make(cube(), tessellation_rate=1, emitter=emitter)
+    view = {"origin": (0, -4, 1), "target": (0, 0, -1.2), "fov": 12}
+    rough = {**floor, "bsdf": {"type": "roughconductor", "alpha": 0.3}}
     strategies = [{"type": "direct", "emitter_samples": e, "bsdf_samples": b} for e, b in ((1, 0), (0, 1), (1, 1))]
-    means = [image(shape, strategy, DARK, view, spp=256, floor=floor(bsdf=rough)).mean() for strategy in strategies]
+    means = [image(shape, strategy, dark, view, spp=256, floor=rough).mean() for strategy in strategies]
     assert means == pytest.approx([means[2]] * 3, rel=ENERGY)
     # The ray goes on from where it has hit: from before the triangle, it would hit it for ever.
     for integrator in ("path", "direct"):
-        assert np.isfinite(image(shape, {"type": integrator, "hide_emitters": True}, floor=floor(), spp=4)).all()
+        assert np.isfinite(image(shape, {"type": integrator, "hide_emitters": True}, floor=floor, spp=4)).all()
 
 
 @pytest.mark.parametrize("eye", [(0.3, -0.2, 5), (0.3, -0.2, -5)])
