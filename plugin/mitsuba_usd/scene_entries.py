@@ -150,10 +150,6 @@ class CachedSurface:
         """Properties of the shape ``subdivision`` that describe the cage."""
         return self.surface.cage.as_properties(mi)
 
-    @cached_property
-    def points(self) -> NDArray[np.float64]:
-        return self.points_of(self.surface.cage.positions)
-
     def points_of(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points on or around the surface of these control points."""
         return positions[self._used] if self._frame_table is None else self._frame_table.apply(positions)[0]
@@ -219,9 +215,7 @@ class Surfaces:
             except CageError:
                 # Entries are made of it later, with the error.
                 return _NO_POINTS
-        is_same = np.array_equal(known.contents.positions, cage.positions)
-        points = known.points if is_same else known.points_of(np.asarray(cage.positions, dtype=np.float64))
-        return points_at(points, shape.to_world)
+        return points_at(known.points_of(np.asarray(cage.positions, dtype=np.float64)), shape.to_world)
 
 
 def subdivision(

@@ -28,6 +28,8 @@ AROUND, ALONG = 64, 24
 # Even permutations of the coordinates that take z to an axis.
 _TURNS = {"X": (2, 0, 1), "Y": (1, 2, 0), "Z": (0, 1, 2)}
 _NO_FACES: IntArray = np.zeros(0, np.int64)
+# Points and normals along the profile of a surface of revolution, as (distance, z).
+Line = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class ShapeReader:
@@ -183,50 +185,27 @@ def read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[CageContents, NDArra
             raise ValueError(f"{name} is {size}; expected a finite number, 0 or more")
         return size
 
+    kind = str(prim.GetTypeName())
     axis = str(value_at(prim.GetAttribute("axis"), time)) if prim.HasAttribute("axis") else "Z"
     if axis not in _TURNS:
         raise ValueError(f'axis is "{axis}"; expected X, Y or Z')
-    points, normals, sizes, vertices = GPRIMS[str(prim.GetTypeName())](number)
     turn = list(_TURNS[axis])
-    if prim.GetTypeName() == "Plane" and axis != "Z":
-        # The width is along x or z, never along y.
-        points, vertices = points[:, [1, 0, 2]], vertices[::-1]
-    cage = CageContents(points[:, turn], sizes, vertices, source=CageSource(str(prim.GetPath())))
+    normals = None
+    if kind == "Cube":
+        points = number("size") / 2 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        vertices = np.array([0, 1, 3, 2, 4, 6, 7, 5, 0, 4, 5, 1, 2, 3, 7, 6, 0, 2, 6, 4, 1, 5, 7, 3])
+    elif kind == "Plane":
+        half = np.array([number("width"), number("length"), 0.0]) / 2
+        points, vertices = half * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.arange(4)
+        if axis != "Z":
+            # The width is along x or z, never along y.
+            points, vertices = points[:, [1, 0, 2]], vertices[::-1]
+    else:
+        height = number("height") if prim.HasAttribute("height") else 0.0
+        points, normals, vertices = _revolved(_OUTLINES[kind](number("radius"), height / 2))
+    source = CageSource(str(prim.GetPath()))
+    cage = CageContents(points[:, turn], np.full(len(vertices) // 4, 4), vertices, source=source)
     return cage, None if normals is None else normals[:, turn]
-
-
-Number = Callable[[str], float]
-Polygons = tuple[NDArray[np.float64], "NDArray[np.float64] | None", IntArray, IntArray]
-# Points and normals along the profile of a surface of revolution, as (distance, z).
-Line = tuple[NDArray[np.float64], NDArray[np.float64]]
-
-
-def _cube(number: Number) -> Polygons:
-    half = number("size") / 2
-    points = half * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
-    vertices = np.array([0, 1, 3, 2, 4, 6, 7, 5, 0, 4, 5, 1, 2, 3, 7, 6, 0, 2, 6, 4, 1, 5, 7, 3])
-    return points, None, np.full(6, 4), vertices
-
-
-def _plane(number: Number) -> Polygons:
-    half = np.array([number("width"), number("length"), 0.0]) / 2
-    points = half * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=np.float64)
-    return points, None, np.array([4]), np.arange(4)
-
-
-def _round(outline: Callable[[float, float], list[Line]], number: Number) -> Polygons:
-    """A surface of revolution, by its outline for a radius and half a height."""
-    return _revolved(outline(number("radius"), number("height") / 2))
-
-
-GPRIMS: dict[str, Callable[[Number], Polygons]] = {
-    "Cube": _cube,
-    "Plane": _plane,
-    "Sphere": lambda number: _revolved([_arc(number("radius"), -90, 90, 0.0)]),
-    "Cylinder": partial(_round, lambda r, h: _lines((0, -h), (r, -h), (r, h), (0, h))),
-    "Cone": partial(_round, lambda r, h: _lines((0, -h), (r, -h), (0, h))),
-    "Capsule": partial(_round, lambda r, h: [_arc(r, -90, 0, -h), *_lines((r, -h), (r, h)), _arc(r, 0, 90, h)]),
-}
 
 
 def _arc(radius: float, start: float, end: float, height: float) -> Line:
@@ -247,8 +226,8 @@ def _lines(*corners: tuple[float, float]) -> list[Line]:
     return lines
 
 
-def _revolved(parts: list[Line]) -> Polygons:
-    """Turn lines of points and normals, ``(distance, z)`` from below to above, around the z axis."""
+def _revolved(parts: list[Line]) -> tuple[NDArray[np.float64], NDArray[np.float64], IntArray]:
+    """Points, normals at face corners and vertices of the quadrilaterals that lines make around the z axis."""
     angle = 2 * np.pi * np.arange(AROUND) / AROUND
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
@@ -263,4 +242,14 @@ def _revolved(parts: list[Line]) -> Polygons:
     here = (rings[:, None] * AROUND + np.arange(AROUND)).ravel()
     beside = here - here % AROUND + (here + 1) % AROUND
     quads = np.stack([here, beside, beside + AROUND, here + AROUND], axis=1)
-    return points, normals[quads.ravel()], np.full(len(quads), 4), quads.ravel()
+    return points, normals[quads.ravel()], quads.ravel()
+
+
+# Surfaces of revolution, by a radius and half a height.
+_OUTLINES: dict[str, Callable[[float, float], list[Line]]] = {
+    "Sphere": lambda r, _: [_arc(r, -90, 90, 0.0)],
+    "Cylinder": lambda r, h: _lines((0, -h), (r, -h), (r, h), (0, h)),
+    "Cone": lambda r, h: _lines((0, -h), (r, -h), (0, h)),
+    "Capsule": lambda r, h: [_arc(r, -90, 0, -h), *_lines((r, -h), (r, h)), _arc(r, 0, 90, h)],
+}
+GPRIMS = ("Cube", "Plane", *_OUTLINES)

@@ -80,7 +80,7 @@ def standard_surface(i: Given) -> dict[str, Input]:
         "specular": i("specular"),
         "specular_color": i("specular_color"),
         "ior": i("specular_IOR"),
-        "roughness": number_mixed(i("specular_roughness"), 1.0, roughening),
+        "roughness": mixed(i("specular_roughness"), 1.0, roughening, "float"),
         "anisotropy": i("specular_anisotropy"),
         "rotation": i("specular_rotation"),
         "transmission": i("transmission"),
@@ -93,7 +93,7 @@ def standard_surface(i: Given) -> dict[str, Input]:
         "sheen": i("sheen"),
         "sheen_color": i("sheen_color"),
         "emission": times(times(i("emission"), i("emission_color")), below),
-        "opacity": luminance(i("opacity")),
+        "opacity": node("extract", "float", in_=node("luminance", "color3", in_=i("opacity")), index=0.0),
     }
 
 
@@ -112,7 +112,7 @@ def open_pbr_surface(i: Given) -> dict[str, Input]:
     below = times(times(darkened, mixed(WHITE, i("coat_color"), coat)), _below_coat(coat, i("coat_ior")))
     of_coat = number("multiply", 2.0, number("power", i("coat_roughness"), 4.0))
     fourth = plus(number("power", i("specular_roughness"), 4.0), of_coat)
-    rough = number_mixed(i("specular_roughness"), number("power", number("min", fourth, 1.0), 0.25), coat)
+    rough = mixed(i("specular_roughness"), number("power", number("min", fourth, 1.0), 0.25), coat, "float")
     # Widths are r^2 sqrt(2 / (1 + (1 - a)^2)) and (1 - a) of that.
     narrow = complement(i("specular_roughness_anisotropy"))
     product = number("divide", number("multiply", 2.0, narrow), plus(1.0, number("multiply", narrow, narrow)))
@@ -178,7 +178,7 @@ def gltf_pbr(i: Given) -> dict[str, Input]:
     below = _below_coat(coat, 1.5)
     # Widths are r^2 and that mixed with 1 by the square of the strength.
     narrow = number("multiply", i("roughness"), i("roughness"))
-    wide = number_mixed(narrow, 1.0, number("multiply", i("anisotropy_strength"), i("anisotropy_strength")))
+    wide = mixed(narrow, 1.0, number("multiply", i("anisotropy_strength"), i("anisotropy_strength")), "float")
     is_isotropic = i("anisotropy_strength") == 0
     is_thin = i("thickness") == 0
     anisotropy = complement(number("divide", narrow, number("max", wide, 1e-6)))
@@ -218,9 +218,9 @@ def powered(a: Input, exponent: Input) -> Input:
     return node("power", "color3", in1=a, in2=exponent)
 
 
-def mixed(background: Input, foreground: Input, amount: Input) -> Input:
-    """Mixture of colours."""
-    return node("mix", "color3", bg=background, fg=foreground, mix=amount)
+def mixed(background: Input, foreground: Input, amount: Input, kind: str = "color3") -> Input:
+    """Mixture of colours, or of numbers."""
+    return node("mix", kind, bg=background, fg=foreground, mix=amount)
 
 
 def number(category: str, a: Input, b: Input) -> Input:
@@ -236,16 +236,6 @@ def plus(a: Input, b: Input) -> Input:
 def complement(a: Input) -> Input:
     """1 less a number."""
     return plus(1.0, number("multiply", -1.0, a))
-
-
-def number_mixed(background: Input, foreground: Input, amount: Input) -> Input:
-    """Mixture of numbers."""
-    return node("mix", "float", bg=background, fg=foreground, mix=amount)
-
-
-def luminance(color: Input) -> Input:
-    """Luminance of a colour as a number."""
-    return node("extract", "float", in_=node("luminance", "color3", in_=color), index=0.0)
 
 
 def reflectance(ior: Input) -> Input:
