@@ -72,7 +72,7 @@ def test_what_is_uploaded_is_there_for_other_threads(variant_llvm_ad_rgb):  # no
     """Shapes that are loaded in parallel read tensors that they are given: a pending copy had other numbers."""
     values = np.arange(1 << 16, dtype=np.float32)
     with ThreadPoolExecutor(2) as pool:
-        for _ in range(100):
+        for _ in range(25):
             # A kernel before, which the copy waits for.
             busy = dr.arange(mi.Float, 1 << 18)
             for _ in range(20):

@@ -80,10 +80,10 @@ def test_work_that_ends_itself_by_an_interrupt_is_told(monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("variant", "shading", "words"),
-    [("scalar_rgb", "vertex", ["--passes", "2"]), ("llvm_ad_rgb", "exact", [])],
+    ("variant", "shading", "seconds", "words"),
+    [("scalar_rgb", "vertex", 0.3, ["--passes", "2"]), ("llvm_ad_rgb", "exact", 1, [])],
 )
-def test_ctrl_c_ends_a_render(tmp_path, shading, words, variant, request):
+def test_ctrl_c_ends_a_render(tmp_path, shading, seconds, words, variant, request):
     if shading == "exact" and hook_problem():
         pytest.skip(str(hook_problem()))
     request.getfixturevalue(f"variant_{variant}")
@@ -101,8 +101,8 @@ def test_ctrl_c_ends_a_render(tmp_path, shading, words, variant, request):
     said = os.read(mine, 1000)
     while b"Rendering" not in said:
         said += os.read(mine, 1000)
-    # Mitsuba's own handler is replaced within a moment.
-    time.sleep(1)
+    # When the render has begun, Mitsuba's own handler is replaced within a moment.
+    time.sleep(seconds)
     render.send_signal(signal.SIGINT)
     out, _ = render.communicate(timeout=60)
     while b"interrupted" not in said:

@@ -18,11 +18,18 @@ LIMITS = Tolerances()
 NOTHING = np.uint32(2**32 - 1)
 # Of a mean of 3,072 squares, and of the variance that few batches measure: five standard deviations and more.
 NOISE = 0.25
+MIDDLE = np.s_[12:20, 12:20]
 
 
 @pytest.fixture(scope="module")
 def reference():
     return random_image(np.random.default_rng(1), 400, "reference")
+
+
+@pytest.fixture
+def judged(reference, np_rng):
+    """Function that compares an image of other noise, with some changes, with the reference."""
+    return lambda *given, batches=4, **changes: compare(reference, random_image(np_rng, batches, **changes), *given)
 
 
 def statuses(result):
@@ -33,22 +40,30 @@ def is_within(worst, low, high):
     return low <= worst.x < high and low <= worst.y < high
 
 
-def dome_with(name, part, value):
-    """A field of the dome's probe, changed in a part of the picture."""
-    values = getattr(dome(), name).copy()
-    values[part] = value
-    return {name: values}
+def probe_with(**changes):
+    """The dome's probe with other values: of a whole field, or of a part of the picture."""
+    fields = {}
+    for name, change in changes.items():
+        if isinstance(change, tuple):
+            part, value = change
+            fields[name] = getattr(dome(), name).copy()
+            fields[name][part] = value
+        else:
+            fields[name] = change
+    return {"probe": replace(dome(), **fields)}
 
 
 def rotated(degrees):
-    normal = dome().normal.astype(float)
-    a, part = math.radians(degrees), np.s_[12:20, 12:20]
-    normal[part] = normal[part] @ np.array([[1, 0, 0], [0, math.cos(a), math.sin(a)], [0, -math.sin(a), math.cos(a)]])
-    return normal.astype(np.float32)
+    a = math.radians(degrees)
+    turn = np.array([[1, 0, 0], [0, math.cos(a), math.sin(a)], [0, -math.sin(a), math.cos(a)]])
+    return MIDDLE, dome().normal[MIDDLE].astype(float) @ turn
 
 
-def with_probe(rng, **changes):
-    return random_image(rng, probe=replace(dome(), **changes))
+def brighter(factor, *part):
+    """The mean, some times as large in a part of the picture."""
+    mean = truth()
+    mean[part] *= factor
+    return mean
 
 
 @pytest.mark.parametrize(("first", "second"), [(4, 4), (4, 16), (400, 4)])
@@ -60,12 +75,12 @@ def test_the_relative_error_of_noise_is_the_one_expected(first, second, np_rng):
     assert abs(measured / expected - 1) < NOISE
 
 
-def test_the_worst_pixel_is_none_that_only_one_image_hits_and_names_values_and_surface(reference, np_rng):
+def test_the_worst_pixel_is_none_that_only_one_image_hits_and_names_values_and_surface(reference, judged):
     """A pixel of the outline is missing, and a normal in the middle is turned."""
     y, x = np.argwhere(dome().hit)[0]
     normal = dome().normal.copy()
     normal[y, x], normal[16, 12] = 0, -normal[16, 12]
-    result = compare(reference, with_probe(np_rng, **dome_with("shape", (y, x), NOTHING), normal=normal))
+    result = judged(**probe_with(shape=((y, x), NOTHING), normal=normal))
     assert statuses(result)["probe"] == "fail"
     assert (result.worst.x, result.worst.y, result.worst.shown_by) == (12, 16, "probe")
     element = dome().element[16, 12]
@@ -83,58 +98,48 @@ def test_evidence_is_of_the_scale_that_is_clearest(reference):
 
 
 @pytest.mark.core
-def test_unchanged_images_pass(reference, np_rng):
-    result = compare(reference, random_image(np_rng, 4, "test"))
+def test_unchanged_images_pass(reference, judged):
+    result = judged()
     assert (statuses(result), result.exit_status) == ({"probe": "pass", "paired": "pass", "tile": "pass"}, 0)
     assert compare(reference, reference).worst is None
 
 
+def failures(pairs, alpha):
+    limits = replace(LIMITS, alpha=alpha)
+    return sum(compare(*pair, ["tile"], limits).status is Status.FAIL for pair in pairs)
+
+
+def images(first, count, batches, **options):
+    return [random_image(np.random.default_rng(seed), batches, **options) for seed in range(first, first + count)]
+
+
 def test_false_alarms_are_as_rare_as_alpha_says(reference):
     """250 images at alpha = 0.2: about 50 may fail, if the corrections are neither missing nor doubled."""
-    limits = replace(LIMITS, alpha=0.2)
-    failed = sum(
-        compare(reference, random_image(np.random.default_rng(seed), 4), ["tile"], limits).status is Status.FAIL
-        for seed in range(1000, 1250)
-    )
     # Scales overlap, which makes Bonferroni's bound loose.
-    assert 15 < failed < 60
-
-
-def test_references_of_as_few_samples_cause_no_more_false_alarms():
-    """Their own noise counts: it is half of that of the differences."""
-    limits = replace(LIMITS, alpha=0.2)
-    images = [random_image(np.random.default_rng(seed), 16) for seed in range(2000, 2120)]
-    pairs = zip(images[::2], images[1::2], strict=True)
-    assert sum(compare(*pair, ["tile"], limits).status is Status.FAIL for pair in pairs) < 24
+    assert 15 < failures(((reference, test) for test in images(1000, 250, 4)), 0.2) < 60
+    # The noise of references of as few samples counts: it is half of that of the differences.
+    both = images(2000, 120, 16)
+    assert failures(zip(both[::2], both[1::2], strict=True), 0.2) < 24
 
 
 @pytest.mark.parametrize("rate", [2e-5, 2e-4, 2e-3, 2e-2])
-def test_rare_events_are_no_alarm(rate):
+def test_rare_events_are_no_alarm_and_changes_beside_them_are_seen(rate):
     """From events that the reference has hardly seen to those of which every tile has some in each batch.
 
-    At alpha = 0.01, three failures of 40 have a probability below 1 %.
+    At alpha = 0.01, three failures of 40 have a probability below 1 %. The change is one of 10 % in a tile, where an
+    event is 20 times the mean of a batch.
     """
     reference = random_image(np.random.default_rng(2), 256, "reference", rate=rate)
-    tests = (random_image(np.random.default_rng(seed), 4, rate=rate) for seed in range(40))
-    assert sum(compare(reference, test, ["tile"]).status is Status.FAIL for test in tests) < 3
-
-
-def test_changes_are_seen_beside_rare_events():
-    """A change of 10 % in a tile, where one event is 20 times the mean of a batch."""
-    mean = truth()
-    mean[8:24, 8:24] *= 1.1
-    reference = random_image(np.random.default_rng(2), 256, "reference", rate=2e-4)
-    tests = (random_image(np.random.default_rng(seed), 4, mean=mean, rate=2e-4) for seed in range(5))
-    assert {compare(reference, test, ["tile"]).status for test in tests} == {Status.FAIL}
+    assert failures(((reference, test) for test in images(0, 40, 4, rate=rate)), 0.01) < 3
+    if rate == 2e-4:
+        changed = images(0, 5, 4, rate=rate, mean=brighter(1.1, np.s_[8:24], np.s_[8:24]))
+        assert failures(((reference, test) for test in changed), 0.01) == 5
 
 
 def test_tiles_at_the_edge_end_with_the_picture():
     """30 by 30 pixels are no multiple of the tiles' sides."""
     mean, nothing = truth()[:30, :30], {"paired": None, "probe": None}
-    reference, test = (
-        random_image(np.random.default_rng(seed), 16, mean=values, **nothing)
-        for seed, values in ((1, mean), (2, 1.5 * mean))
-    )
+    reference, test = (images(seed, 1, 16, mean=seed * mean, **nothing)[0] for seed in (2, 3))
     failing = compare(reference, test, ["tile"]).tiers[0].numbers["failing"]
     ends = np.array([(tile["x"] + tile["width"], tile["y"] + tile["height"]) for tile in failing])
     assert (ends.max(axis=0) == 30).all()
@@ -153,10 +158,9 @@ def test_nothing_is_an_alarm_where_the_same_samples_give_the_same_bits(reference
 
 
 @pytest.mark.parametrize(("side", "factor"), [(4, 1.4), (8, 1.2), (16, 1.08), (SIZE, 1.03)])
-def test_each_scale_sees_changes_of_its_size(reference, np_rng, side, factor):
-    mean = truth()
-    mean[8 : 8 + side, 8 : 8 + side] *= factor
-    result = compare(reference, random_image(np_rng, 8, mean=mean), ["tile"]).tier("tile")
+def test_each_scale_sees_changes_of_its_size(judged, side, factor):
+    part = np.s_[8 : 8 + side]
+    result = judged(["tile"], batches=8, mean=brighter(factor, part, part)).tier("tile")
     assert result.status is Status.FAIL
     assert result.worst[0] >= 4
 
@@ -184,12 +188,6 @@ def test_angles_between_normals_are_those_of_a_turn(degrees):
     assert math.isclose(normal_angle(np.array([1.0, 0, 0]), turned), degrees, rel_tol=1e-9)
 
 
-def test_probes_that_hit_nothing_are_alike(reference, np_rng):
-    sky = replace(dome(), **{name: np.full_like(dome().shape, NOTHING) for name in ("shape", "triangle", "element")})
-    result = compare(replace(reference, probe=sky), random_image(np_rng, 4, probe=sky), ["probe"])
-    assert result.status is Status.PASS
-
-
 def test_a_change_below_the_floor_is_single_precision(reference, np_rng):
     tight = replace(reference, estimate=replace(reference.estimate, variance=0 * reference.estimate.variance))
     for factor, status in ((1 + 5e-4, Status.PASS), (1 + 5e-3, Status.FAIL)):
@@ -198,17 +196,16 @@ def test_a_change_below_the_floor_is_single_precision(reference, np_rng):
         assert compare(tight, test, ["tile"]).status is status
 
 
-def test_more_scenes_ask_for_more_evidence(reference, np_rng):
-    result = (compare(reference, random_image(np_rng), ["tile"], suite_size=count).tier("tile") for count in (1, 10))
-    of_one, of_ten = (tier.numbers["scales"]["8"]["limit"] for tier in result)
+def test_more_scenes_ask_for_more_evidence(judged):
+    of_one, of_ten = (judged(["tile"], LIMITS, n).tier("tile").numbers["scales"]["8"]["limit"] for n in (1, 10))
     assert of_one == pytest.approx(1 - (1 - 0.01 / 4) ** (1 / (16 * 3)))
     assert of_ten == pytest.approx(of_one / 10, rel=2e-3)
 
 
-def test_one_batch_has_no_variance_and_a_reference_needs_16_times_the_samples(reference, np_rng):
+def test_one_batch_has_no_variance_and_a_reference_needs_16_times_the_samples(judged):
     """It has 400 batches."""
-    assert "the test has one batch" in compare(reference, random_image(np_rng, 1)).tier("tile").lines[0]
-    told = [compare(reference, random_image(np_rng, n), ["tile"]).tier("tile").lines for n in (25, 26)]
+    assert "the test has one batch" in judged(batches=1).tier("tile").lines[0]
+    told = [judged(["tile"], batches=n).tier("tile").lines for n in (25, 26)]
     assert ["the reference has less than 16 times the samples" in str(lines) for lines in told] == [False, True]
 
 
@@ -224,82 +221,82 @@ def test_what_is_not_finite_fails_first_and_by_name(reference, np_rng, value, ro
     assert line == f"the {role} is not: G = {value} at x = 5, y = 3 and at 2 more pixels; channels R, G"
 
 
+def other_triangles(count):
+    return {"triangle": (np.s_[16, 16 : 16 + count], 7)}
+
+
 PROBES = {
-    "normals turned by 0.1 degrees": (lambda: {"normal": rotated(0.1)}, "fail", "degrees"),
-    "normals turned by 0.001 degrees": (lambda: {"normal": rotated(0.001)}, "pass", "within"),
-    "points moved by 1e-3": (lambda: {"position": dome().position + np.float32(1e-3)}, "fail", "hit points"),
-    "points moved by 1e-6": (lambda: {"position": dome().position + np.float32(1e-6)}, "pass", "within"),
-    "a hole": (lambda: dome_with("shape", np.s_[14:17, 14:17], NOTHING), "fail", "another shape"),
-    "other elements": (lambda: dome_with("element", np.s_[10:14, 10:14], 7), "fail", "another element"),
-    "other parameters": (lambda: {"uv": dome().uv + np.float32(0.01)}, "fail", "surface parameters"),
-    "other triangles": (lambda: {"triangle": dome().triangle + np.uint32(1)}, "warn", "another triangle"),
+    "normals turned by 0.1 degrees": ({"normal": rotated(0.1)}, "fail", "degrees"),
+    "normals turned by 0.001 degrees": ({"normal": rotated(0.001)}, "pass", "within"),
+    "points moved by 1e-3": ({"position": dome().position + np.float32(1e-3)}, "fail", "hit points"),
+    "points moved by 1e-6": ({"position": dome().position + np.float32(1e-6)}, "pass", "within"),
+    "a hole": ({"shape": (np.s_[14:17, 14:17], NOTHING)}, "fail", "another shape"),
+    "other elements": ({"element": (np.s_[10:14, 10:14], 7)}, "fail", "another element"),
+    "other parameters": ({"uv": dome().uv + np.float32(0.01)}, "fail", "surface parameters"),
+    "another triangle in one pixel of 1,024": (other_triangles(1), "pass", "within"),
+    "other triangles in two": (other_triangles(2), "warn", "another triangle"),
 }
 
 
 @pytest.mark.core
 @pytest.mark.parametrize(("changes", "status", "word"), PROBES.values(), ids=PROBES)
-def test_probe(reference, np_rng, changes, status, word):
-    result = compare(reference, with_probe(np_rng, **changes()), ["probe"]).tier("probe")
+def test_probe(judged, changes, status, word):
+    result = judged(["probe"], **probe_with(**changes)).tier("probe")
     assert result.status.value == status
     assert word in result.lines[0]
+    if "triangle" in changes:
+        assert result.numbers["triangle_fraction"] == (1 if status == "pass" else 2) / SIZE**2
 
 
-def test_normals_at_silhouettes_do_not_count_and_from_the_third_pixel_on_they_do(reference, np_rng):
+def test_probes_that_hit_nothing_are_alike(reference, np_rng):
+    sky = replace(dome(), **{name: np.full_like(dome().shape, NOTHING) for name in ("shape", "triangle", "element")})
+    result = compare(replace(reference, probe=sky), random_image(np_rng, probe=sky), ["probe"])
+    assert result.status is Status.PASS
+
+
+def test_normals_at_silhouettes_do_not_count_and_from_the_third_pixel_on_they_do(judged):
     """A silhouette is each pixel beside one of another shape; the eight neighbours of these do not count either."""
     shape = dome().shape
     rim = np.zeros(shape.shape, dtype=bool)
     rim[:, 1:] = shape[:, 1:] != shape[:, :-1]
-    changed = with_probe(np_rng, **dome_with("normal", rim & (shape == 0), (0, 0, 1)))
-    assert compare(reference, changed, ["probe"]).exit_status == 0
+    assert judged(["probe"], **probe_with(normal=(rim & (shape == 0), (0, 0, 1)))).exit_status == 0
     silhouette = [(0, 0), (0, 1), (1, 0), (0, -1), (-1, 0)]
     for y, x in np.argwhere(np.ones((7, 7))) - 3:
-        normal = dome().normal.copy()
-        normal[16 + y, 16 + x] *= -1
-        changed = with_probe(np_rng, normal=normal, **dome_with("shape", (16, 16), NOTHING))
-        result = compare(reference, changed, ["probe"])
+        turned = (16 + y, 16 + x), -dome().normal[16 + y, 16 + x]
+        result = judged(["probe"], **probe_with(normal=turned, shape=((16, 16), NOTHING)))
         is_near = any(max(abs(y - b), abs(x - a)) <= 1 for b, a in silhouette)
         assert result.tier("probe").status is (Status.PASS if is_near else Status.FAIL), (y, x)
 
 
 @pytest.mark.parametrize(("other", "what"), [("angle_p999", "maximum"), ("angle_max", "99.9th percentile")])
-def test_the_worst_normal_is_none_at_a_silhouette(reference, np_rng, other, what):
+def test_the_worst_normal_is_none_at_a_silhouette(judged, other, what):
     """Its own is turned more than those of some pixels in the middle."""
-    normal = rotated(20)
+    normal = probe_with(normal=rotated(20))["probe"].normal
     normal[tuple(np.argwhere(dome().hit)[0])] *= -1
-    result = compare(reference, with_probe(np_rng, normal=normal), ["probe"], LIMITS.with_values({other: 180}))
+    result = judged(["probe"], LIMITS.with_values({other: 180}), **probe_with(normal=normal))
     assert f"degrees between normals, {what}" in result.tier("probe").lines[0]
     assert is_within(result.worst, 12, 20)
 
 
-def test_one_pixel_in_a_thousand_may_hit_another_triangle(reference, np_rng):
-    for count, status in ((1, Status.PASS), (2, Status.WARN)):
-        triangle = dome().triangle.copy()
-        triangle[16, 16 : 16 + count] += 1
-        result = compare(reference, with_probe(np_rng, triangle=triangle), ["probe"]).tier("probe")
-        assert (result.status, result.numbers["triangle_fraction"]) == (status, count / SIZE**2)
-
-
-def test_the_worst_pixel_is_of_what_fails_before_what_is_a_warning(reference, np_rng):
+def test_the_worst_pixel_is_of_what_fails_before_what_is_a_warning(reference, judged):
     """Another environment makes pixels of the same samples a warning; and a square is brighter."""
-    paired, mean = reference.paired.copy(), truth()
+    paired = reference.paired.copy()
     paired[7, 9] *= 1.001
-    mean[16:24, 16:24] *= 2
     other = {**METADATA, "environment": {"llvm": "1", "processor": "b"}}
-    result = compare(reference, random_image(np_rng, mean=mean, paired=paired, metadata=other))
+    result = judged(mean=brighter(2, np.s_[16:24], np.s_[16:24]), paired=paired, metadata=other)
     assert statuses(result) == {"probe": "pass", "paired": "warn", "tile": "fail"}
     assert (result.tier("paired").worst, result.worst.shown_by) == ((7, 9), "tile")
     assert is_within(result.worst, 16, 24)
 
 
-def test_paired_differences_fail_and_say_where_but_rounding_passes_unless_bits_are_asked_for(reference, np_rng):
+def test_paired_differences_fail_and_say_where_but_rounding_passes_unless_bits_are_asked_for(reference, judged):
     paired = reference.paired.copy()
     paired[7, 9, 2] *= 1.001
-    result = compare(reference, random_image(np_rng, paired=paired))
+    result = judged(paired=paired)
     assert statuses(result) == {"probe": "pass", "paired": "fail", "tile": "pass"}
     assert (result.worst.x, result.worst.y, result.exit_status) == (9, 7, 2)
-    rounded = random_image(np_rng, paired=reference.paired * (1 + 2e-7))
-    assert compare(reference, rounded, ["paired"]).exit_status == 0
-    assert compare(reference, rounded, ["paired"], replace(LIMITS, paired_relative=0)).exit_status == 2
+    for limits, status in ((LIMITS, 0), (replace(LIMITS, paired_relative=0), 2)):
+        assert judged(["paired"], limits, paired=reference.paired * (1 + 2e-7)).exit_status == status
 
 
 @pytest.mark.parametrize(("part", "status"), [(0.5, "pass"), (2, "fail")])
@@ -311,34 +308,32 @@ def test_differences_of_dark_pixels_are_relative_to_a_thousandth_of_the_mean(ref
     assert statuses(compare(*images, ["paired"]))["paired"] == status
 
 
-def test_another_environment_downgrades_to_the_tile_tier(reference, np_rng):
-    other = {**METADATA, "environment": {"llvm": "19", "processor": "a"}}
-    changed = {"paired": 1.001 * reference.paired, "metadata": other}
-    result = compare(reference, random_image(np_rng, **changed), ["paired"])
-    assert (statuses(result), result.exit_status) == ({"paired": "warn", "tile": "pass"}, 1)
-    assert "llvm 19 here, 23 in the reference" in str(result)
-    same = compare(reference, random_image(np_rng, metadata=other), ["paired"])
-    assert statuses(same) == {"paired": "pass"}
-    # Without a variance, there is none to fall back on.
-    lacking = {**changed, "metadata": {**METADATA, "environment": {}}, "estimate": None}
-    assert compare(reference, random_image(np_rng, **lacking), ["paired", "probe"]).exit_status == 2
-
-
-SKIPPED = {"paired": "skipped", "tile": "pass"}
+SKIPPED, WARNED = {"paired": "skipped", "tile": "pass"}, {"paired": "warn", "tile": "pass"}
 
 
 @pytest.mark.parametrize(
-    ("change", "expected", "said"),
+    ("change", "factor", "expected", "said"),
     [
-        ({"variant": "scalar_rgb"}, SKIPPED, "variant scalar_rgb"),
-        ({"paired": {"seed": 4, "spp": 16}}, SKIPPED, "seed 4"),
-        ({"files": {"scene.xml": "2"}}, {"paired": "pass"}, "changed since the reference was made: scene.xml"),
+        ({"environment": {"llvm": "19", "processor": "a"}}, 1.001, WARNED, "llvm 19 here, 23 in the reference"),
+        ({"environment": {"llvm": "19", "processor": "a"}}, 1, {"paired": "pass"}, ""),
+        ({"variant": "scalar_rgb"}, 1, SKIPPED, "variant scalar_rgb"),
+        ({"paired": {"seed": 4, "spp": 16}}, 1, SKIPPED, "seed 4"),
+        ({"files": {"scene.xml": "2"}}, 1, {"paired": "pass"}, "changed since the reference was made: scene.xml"),
     ],
 )
-def test_other_samples_downgrade_to_the_tile_tier_and_other_files_are_named(reference, np_rng, change, expected, said):
-    result = compare(reference, random_image(np_rng, metadata={**METADATA, **change}), ["paired"])
+def test_other_environments_and_samples_ask_the_tile_tier_and_other_files_are_named(
+    reference, judged, change, factor, expected, said
+):
+    result = judged(["paired"], paired=factor * reference.paired, metadata={**METADATA, **change})
     assert statuses(result) == expected
+    assert result.exit_status == (expected == WARNED)
     assert said in str(result)
+
+
+def test_in_another_environment_without_a_variance_differences_fail(reference, judged):
+    """There is none for the tile tier."""
+    lacking = {"metadata": {**METADATA, "environment": {}}, "estimate": None}
+    assert judged(["paired", "probe"], paired=1.001 * reference.paired, **lacking).exit_status == 2
 
 
 UNUSABLE = {
