@@ -10,9 +10,12 @@ import sys
 import mitsuba as mi
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from mitsuba_subdivision import example_file
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.named_cages import cube
+from mitsuba_subdivision.figures import FIGURES, FigureOptions
+from mitsuba_subdivision.figures.output import write_figure
 from mitsuba_subdivision.messages import print_error
 from mitsuba_subdivision.regression.image import write_exr
 
@@ -24,6 +27,7 @@ SCENE = """<scene version="3.0.0"><integrator type="direct"/>
 LOOP = SCENE.replace("</shape>", '<string name="scheme" value="loop"/></shape>')
 BARE = SCENE.replace('<integrator type="direct"/>', "")
 RENDER = ["render", "scene.xml", "-o", "picture.exr"]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 
 
 @pytest.fixture
@@ -92,11 +96,11 @@ def test_wrong_values_are_told(capsys, words, message):
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("suffix", ["ply", "usda"])
 @pytest.mark.usefixtures("folder")
-def test_saving_into_a_missing_folder_is_told_by_its_name(suffix):
-    with pytest.raises(FileNotFoundError, match=f'^"missing/cube.{suffix}": there is no folder "missing"$'):
-        cube().save(f"missing/cube.{suffix}")
+def test_saving_into_a_missing_folder_is_told_by_its_name():
+    for suffix in ("ply", "usda"):
+        with pytest.raises(FileNotFoundError, match=f'^"missing/cube.{suffix}": there is no folder "missing"$'):
+            cube().save(f"missing/cube.{suffix}")
 
 
 NEEDS_PASSES = "--batch is for passes; expected --pass, --passes, --dask or --reference beside it"
@@ -189,8 +193,12 @@ def test_a_picture_of_the_scene_is_no_output(folder, capsys, more):
     assert light.read_bytes() == before
 
 
-def test_every_command_makes_the_folder_of_its_output(folder):
+def test_every_command_makes_the_folder_of_its_output(folder, monkeypatch):
     picture = str(folder / "a" / "b" / "picture.exr")
+    # Of reports and figures, drawing takes most of the time.
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: save(figure, path, **{**more, "dpi": 20}))
+    monkeypatch.setitem(write_figure.__kwdefaults__, "layouts", 1)
     assert render("-o", picture, "--spp", "2", "--passes", "1") == 0
     assert main(["merge", picture, "-o", "c/d/merged.exr"]) == 0
     assert main(["compare", picture, "c/d/merged.exr", "--json", "e/f.json", "--html", "g/h"]) == 0
@@ -207,8 +215,6 @@ def test_names_of_formats_may_have_capital_letters(folder):
 
 
 def test_figures_have_the_options_that_the_command_line_knows():
-    from mitsuba_subdivision.figures import FIGURES, FigureOptions
-
     known = {field.name for field in dataclasses.fields(FigureOptions)}
     for figure in FIGURES.values():
         assert set(figure.options) <= known
@@ -221,8 +227,7 @@ def test_a_command_does_not_wait_for_what_others_import():
 from mitsuba_subdivision.commands import COMMANDS, parser
 assert all(name in parser(["info"]).format_help() for name in COMMANDS)
 print([name for name in sys.modules if name.startswith("mitsuba_subdivision.")])"""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-c", program], env=ENVIRONMENT, capture_output=True, text=True, check=True)
     assert "mitsuba_subdivision.commands.info" in done.stdout
     assert not re.search(r"\.(studio|regression|figures|commands\.render)\b", done.stdout)
 
@@ -230,17 +235,14 @@ print([name for name in sys.modules if name.startswith("mitsuba_subdivision.")])
 @pytest.mark.parametrize("words", [["info", "cube.obj"], ["info", "missing.obj"], ["--help"]])
 def test_a_closed_pipe_is_no_error(folder, words):
     # The status is what it is where somebody listens, and nothing is said.
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-m", "mitsuba_subdivision", *words]
     read, write = os.pipe()
     os.close(read)
     is_wrong = "missing.obj" in words
     streams = {"stderr" if is_wrong else "stdout": write, "stdout" if is_wrong else "stderr": subprocess.PIPE}
-    done = subprocess.run(command, cwd=folder, env=environment, text=True, check=False, **streams)
+    done = subprocess.run(command, cwd=folder, env=ENVIRONMENT, text=True, check=False, **streams)
     os.close(write)
-    assert done.returncode == is_wrong
-    assert not done.stdout
-    assert not done.stderr
+    assert (done.returncode, done.stdout or "", done.stderr or "") == (is_wrong, "", "")
 
 
 # The reason is told that its message refers to.

@@ -7,16 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage.named_cages import extraordinary
-from mitsuba_subdivision.figures.normal_error import (
-    LEVELS,
-    ROWS,
-    RULES,
-    exact_normals,
-    normal_errors,
-    offset_cage,
-    surface_of,
-    vertex_normal,
-)
+from mitsuba_subdivision.figures import normal_error
+from mitsuba_subdivision.figures.normal_error import ROWS, normal_errors, surface_of, vertex_normal
 from mitsuba_subdivision.figures.staging import project
 
 SCENES = Path(__file__).parents[2] / "scenes"
@@ -69,7 +61,8 @@ def test_the_artefact_comes_from_the_offset_of_the_cage_and_one_rule_of_three_ha
         for at, lost in ((surface, True), (centred, False)):
             assert (vertex_normal(at, "stam", offset)[2] > 45) == lost
         stam, stabilised, limit = (
-            vertex_normal(surface, evaluator, offset if is_beside else 0.0) for _, evaluator, is_beside in RULES
+            vertex_normal(surface, evaluator, offset if is_beside else 0.0)
+            for _, evaluator, is_beside in normal_error.RULES
         )
         # Each is its level, the distance from the origin and the error.
         assert stam[2] > 45
@@ -94,8 +87,8 @@ MOVED = 2
 
 @cache
 def cage_and_normals(valence, offset):
-    cage = offset_cage(extraordinary(valence), offset)
-    return cage, exact_normals(cage)
+    cage = normal_error.offset_cage(extraordinary(valence), offset)
+    return cage, normal_error.exact_normals(cage)
 
 
 @pytest.mark.parametrize(("valence", "dtype"), FIRST_WRONG)
@@ -118,4 +111,4 @@ def test_the_limit_normal_is_reached_as_the_eigenvalues_say():
     slope = np.diff(np.log(error[10:30])).mean()
     # lambda_4 / lambda_2 at valence 3.
     assert slope == pytest.approx(np.log(1 / 6 / 0.4100970508), abs=0.02)
-    assert len(error) == len(LEVELS)
+    assert len(error) == len(normal_error.LEVELS)

@@ -12,31 +12,18 @@ import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, example_file
 from mitsuba_subdivision.__main__ import parser
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
-from mitsuba_subdivision.figures import FIGURES, FigureError, FigureOptions, peers
-from mitsuba_subdivision.figures.cages import (
-    INFINITE,
-    TITLES,
-    _tagged,
-    area_share,
-    extraordinary_count,
-    labels,
-    regular_elements,
+from mitsuba_subdivision.figures import (
+    FIGURES,
+    FigureError,
+    FigureOptions,
+    cages,
+    characteristic,
+    fit,
+    normal_error,
+    peers,
+    scenes,
 )
-from mitsuba_subdivision.figures.characteristic import (
-    bent_ball,
-    characteristic_points,
-    growth,
-    largest_by_level,
-    on_patch,
-    patch_of_valence,
-    refinement_step,
-    sector,
-    sub_domain,
-)
-from mitsuba_subdivision.figures.fit import DIAGONAL, ball_cage, distances, in_front
-from mitsuba_subdivision.figures.normal_error import ZOOM_OFFSET, ZOOM_VALENCE, normals_by, offset_cage, panel_samples
 from mitsuba_subdivision.figures.output import write_figure
-from mitsuba_subdivision.figures.scenes import COLUMNS, HIGHEST, LOWEST, ROWS, quilt
 from mitsuba_subdivision.figures.staging import around_vertices, frame, project, visible
 from mitsuba_subdivision.regression.image import read_channels
 from mitsuba_subdivision.schemes import scheme_named
@@ -151,7 +138,7 @@ def test_cages_around_a_vertex_have_it_first_and_where_it_is_asked_for(users_cag
     assert len(cage.holes) < cage.face_count
     for result, expected in zip(frame(LimitSurface(cage)), like, strict=True):
         np.testing.assert_allclose(result, expected, atol=1e-9)
-    # The same surface, but for where it lies: ratios of distances stay.
+    # The same surface, but for where it lies: ratios of fit.distances stay.
     original = ControlCage.from_file(users_cage)
     while original.face_count < cage.face_count:
         original = original.refined()
@@ -188,17 +175,17 @@ def test_scalar_variants_draw_too_all_but_fits(options):
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_the_distance_of_surfaces_is_that_of_spheres():
     """Of two spheres around one point, the difference of their radii, but for gaps between samples."""
-    inner, outer = (ball_cage(4, radius) for radius in (0.5, 0.6))
-    assert distances(outer, [inner])[0] * DIAGONAL == pytest.approx(0.1, rel=0.03)
+    inner, outer = (fit.ball_cage(4, radius) for radius in (0.5, 0.6))
+    assert fit.distances(outer, [inner])[0] * fit.DIAGONAL == pytest.approx(0.1, rel=0.03)
 
 
 def test_numbers_stand_on_edges_that_the_camera_sees():
-    seen = in_front(cube(), np.array([5.0, -6, 4]))
+    seen = fit.in_front(cube(), np.array([5.0, -6, 4]))
     hidden = cube().positions[cube().edges[~seen]]
     # Those that meet in the corner across.
     assert len(hidden) == 3
     assert (hidden == [-1, 1, -1]).all(axis=2).any(axis=1).all()
-    assert in_front(cube(), np.array([5.0, 0, 0])).sum() == 4
+    assert fit.in_front(cube(), np.array([5.0, 0, 0])).sum() == 4
 
 
 @pytest.fixture
@@ -237,24 +224,24 @@ def test_other_programs_are_drawn_only_where_they_are(options):
 
 def test_each_panel_of_creases_has_tags_of_its_own():
     cage = ControlCage.from_file(example_file("cages/rook.obj"))
-    smooth, tagged, infinite = (_tagged(cage, name).tags.edges for name in TITLES)
+    smooth, tagged, infinite = (cages._tagged(cage, name).tags.edges for name in cages.TITLES)
     assert not smooth.any()
     assert tagged is cage.tags.edges
-    assert np.array_equal(infinite, np.where(tagged > 0, INFINITE, 0))
+    assert np.array_equal(infinite, np.where(tagged > 0, cages.INFINITE, 0))
     # The legend tells every sharpness there is.
     assert set(tagged[tagged > 0]) == {1.2, 1.5, 2, 3, 4, 10}
-    assert list(labels(tagged).values()) == ["1.2\u20132", "3\u20134", "∞"]
+    assert list(cages.labels(tagged).values()) == ["1.2\u20132", "3\u20134", "∞"]
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_the_displaced_jar_has_no_step_at_its_seam_and_plain_ends():
-    heights = quilt()
-    assert heights.shape == (ROWS, COLUMNS)
+    heights = scenes.quilt()
+    assert heights.shape == (scenes.ROWS, scenes.COLUMNS)
     # The last column is as near to the first one as any two neighbours.
     steps = np.abs(np.diff(heights, axis=1)).max()
     assert np.abs(heights[:, 0] - heights[:, -1]).max() <= 1.01 * steps
-    along = (np.arange(ROWS) + 0.5) / ROWS
-    assert not heights[(along < LOWEST) | (along > HIGHEST)].any()
+    along = (np.arange(scenes.ROWS) + 0.5) / scenes.ROWS
+    assert not heights[(along < scenes.LOWEST) | (along > scenes.HIGHEST)].any()
     assert 0.9 < heights.max() <= 1
     cage = ControlCage.from_file(example_file("cages/jar.obj"))
     assert set(cage.tags.edges) == {0, 10}
@@ -263,8 +250,8 @@ def test_the_displaced_jar_has_no_step_at_its_seam_and_plain_ends():
 @pytest.mark.core
 @pytest.mark.parametrize("valence", [3, 5, 8])
 def test_a_refinement_step_has_the_points_of_the_report(valence):
-    patch = patch_of_valence(scheme_named("catmull_clark"), valence)
-    old, new, old_edges, new_edges = refinement_step(patch, valence)
+    patch = characteristic.patch_of_valence(scheme_named("catmull_clark"), valence)
+    old, new, old_edges, new_edges = characteristic.refinement_step(patch, valence)
     assert len(old) == 2 * valence + 8
     assert len(new) == 2 * valence + 17
     # Neither set has two points in one place, and every new point has an edge.
@@ -277,13 +264,15 @@ def test_a_refinement_step_has_the_points_of_the_report(valence):
 def test_the_characteristic_map_scales_by_the_subdominant_eigenvalue():
     for name in ("catmull_clark", "loop", "doo_sabin"):
         scheme = scheme_named(name)
-        patch = patch_of_valence(scheme, 5)
-        image = partial(on_patch, scheme, patch.signature, characteristic_points(patch, 5))
-        first, third = (image(sub_domain(scheme.domain, level, 2)) for level in (0, 2))
+        patch = characteristic.patch_of_valence(scheme, 5)
+        image = partial(
+            characteristic.on_patch, scheme, patch.signature, characteristic.characteristic_points(patch, 5)
+        )
+        first, third = (image(characteristic.sub_domain(scheme.domain, level, 2)) for level in (0, 2))
         np.testing.assert_allclose(third, patch.basis.subdominant**2 * first, atol=1e-12)
-        # One sector ends where the next begins.
+        # One characteristic.sector ends where the next begins.
         edge = np.array([(0.0, 0.7), (0.7, 0.0)])
-        np.testing.assert_allclose(image(edge[:1]), sector(image(edge[1:]), 1, 5), atol=1e-12)
+        np.testing.assert_allclose(image(edge[:1]), characteristic.sector(image(edge[1:]), 1, 5), atol=1e-12)
 
 
 def test_subdivision_keeps_the_number_of_extraordinary_points():
@@ -292,13 +281,13 @@ def test_subdivision_keeps_the_number_of_extraordinary_points():
     shares = []
     for _ in range(3):
         surface = LimitSurface(cage)
-        assert extraordinary_count(cage.topology) == 20
-        shares.append(area_share(surface, regular_elements(surface)))
+        assert cages.extraordinary_count(cage.topology) == 20
+        shares.append(cages.area_share(surface, cages.regular_elements(surface)))
         cage = cage.refined()
     assert shares[0] == 0 < shares[1] < shares[2] < 1
     # Every irregular patch of level 2 has one extraordinary vertex: as many as the vertices have corners.
     valences = surface.cage.topology.vertex_face_count
-    assert (~regular_elements(surface)).sum() == valences[valences != 4].sum()
+    assert (~cages.regular_elements(surface)).sum() == valences[valences != 4].sum()
 
 
 def test_projection_finds_what_the_camera_sees(variants_all_rgb):  # noqa: ARG001
@@ -322,18 +311,18 @@ def test_projection_finds_what_the_camera_sees(variants_all_rgb):  # noqa: ARG00
 
 @pytest.mark.parametrize("valence", [3, 5, 8])
 def test_curvature_grows_as_the_eigenvalues_say(valence):
-    largest = largest_by_level(bent_ball(valence), valence)
-    assert (largest[-1] / largest[-5]) ** (1 / 4) == pytest.approx(growth(valence), abs=0.02)
+    largest = characteristic.largest_by_level(characteristic.bent_ball(valence), valence)
+    assert (largest[-1] / largest[-5]) ** (1 / 4) == pytest.approx(characteristic.growth(valence), abs=0.02)
 
 
 def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noqa: ARG001
-    surface = LimitSurface(offset_cage(extraordinary(ZOOM_VALENCE), ZOOM_OFFSET))
+    surface = LimitSurface(normal_error.offset_cage(extraordinary(normal_error.ZOOM_VALENCE), normal_error.ZOOM_OFFSET))
     for magnification, wrong in ((1, 1e-2), (1_000_000, 10)):
-        samples = panel_samples(surface, magnification, 8)
+        samples = normal_error.panel_samples(surface, magnification, 8)
         # The elements at the point cover the picture, at every magnification.
         extent = np.abs(samples[1][:, -1, :2]).max(axis=1)
         assert extent.min() > 0.9
-        stam, stabilised = (normals_by(surface, *samples, name)[2] for name in ("stam", "stabilized"))
+        stam, stabilised = (normal_error.normals_by(surface, *samples, name)[2] for name in ("stam", "stabilized"))
         assert stabilised < 1e-4
         assert (stam > wrong) == (magnification > 1)
 

@@ -11,7 +11,6 @@ from mitsuba_subdivision.schemes import CatmullClark, StencilTable, register_sch
 
 SCENES = Path(__file__).parents[2] / "scenes"
 RESOLUTION = 64
-ELEMENT = "face_element"
 
 
 def scene_of(valence, **parameters):
@@ -19,44 +18,42 @@ def scene_of(valence, **parameters):
     return load_scene(path, {"resolution": RESOLUTION, **parameters}, "box").scene
 
 
-def subdivision(scene):
-    return next(p for p in map(mi.traverse, scene.shapes()) if "control_points" in p)
+def changed(valence, name, change):
+    """A scene in which a parameter of the surface is another one: what a function makes of it."""
+    scene = scene_of(valence)
+    shape = next(p for p in map(mi.traverse, scene.shapes()) if "control_points" in p)
+    shape[name] = change(shape)
+    shape.update()
+    return scene
 
 
 def brighter(valence):
     """The albedo of the surface, one per cent higher."""
-    scene = scene_of(valence)
-    parameters = mi.traverse(scene)
-    shape = next(key for key in parameters.keys() if key.endswith("control_points")).rpartition(".")[0]  # noqa: SIM118
-    parameters[f"{shape}.bsdf.reflectance.value"] *= 1.01
-    parameters.update()
-    return scene
+    return changed(valence, "bsdf.reflectance.value", lambda shape: 1.01 * shape["bsdf.reflectance.value"])
 
 
 def turned_normals(valence):
     """The normals of one patch, turned by 0.1 degrees."""
-    scene = scene_of(valence)
-    mesh = subdivision(scene)
-    normals = np.array(mesh["vertex_normals"], dtype=np.float64).reshape(-1, 3)
-    faces = np.array(mesh["faces"]).reshape(-1, 3)
-    vertices = np.unique(faces[np.array(mesh[ELEMENT]) == 0])
-    angle = np.radians(0.1)
-    turn = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]])
-    normals[vertices] = normals[vertices] @ turn.T
-    mesh["vertex_normals"] = upload(mi.Float, normals)
-    mesh.update()
-    return scene
+
+    def turned(shape):
+        normals = np.array(shape["vertex_normals"], dtype=np.float64).reshape(-1, 3)
+        vertices = np.unique(np.array(shape["faces"]).reshape(-1, 3)[np.array(shape["face_element"]) == 0])
+        c, s = np.cos(np.radians(0.1)), np.sin(np.radians(0.1))
+        normals[vertices] = normals[vertices] @ [[1, 0, 0], [0, c, s], [0, -s, c]]
+        return upload(mi.Float, normals)
+
+    return changed(valence, "vertex_normals", turned)
 
 
 def moved_vertex(valence):
     """One vertex of the cage, moved by 1e-3 along z."""
-    scene = scene_of(valence)
-    mesh = subdivision(scene)
-    points = np.array(mesh["control_points"])
-    points[2] += 1e-3
-    mesh["control_points"] = upload(mi.Float, points)
-    mesh.update()
-    return scene
+
+    def moved(shape):
+        points = np.array(shape["control_points"])
+        points[2] += 1e-3
+        return upload(mi.Float, points)
+
+    return changed(valence, "control_points", moved)
 
 
 def stam(valence):
@@ -72,8 +69,6 @@ class OtherVertexRule(CatmullClark):
         refinement = super().refine(topology)
         matrix = refinement.stencils.matrix.tolil()
         for vertex in np.flatnonzero(~topology.is_border_vertex & (topology.vertex_face_count != 4)):
-            if vertex >= topology.vertex_count:
-                continue
             others = [column for column in matrix.rows[vertex] if column != vertex]
             matrix[vertex, vertex] += 1e-3
             for column in others:
