@@ -9,7 +9,6 @@ import sys
 import traceback
 import warnings
 from collections import Counter
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
@@ -177,32 +176,6 @@ def random_cage(rng):
     return ControlCage(points, faces, **rules), scheme
 
 
-@dataclass(frozen=True)
-class Differences:
-    """What a cage's surface and that of its refined cage differ by, at some samples."""
-
-    point: float
-    normal: float  # The largest angle in radians, over what is allowed of it.
-    # How many normals are exactly zero, and how many are of unit length, of all. The others are wrong.
-    zero: int
-    unit: int
-    count: int
-    unlike: int  # Samples at which one normal is zero and the other is not, though tangents are far from parallel.
-
-    @property
-    def problem(self):
-        """What is wrong, if anything."""
-        if not self.point <= POINT:
-            return f"points differ by {self.point:.1e}"
-        if self.zero + self.unit != self.count:
-            return f"{self.count - self.zero - self.unit} normals neither unit nor zero"
-        if self.unlike:
-            return f"{self.unlike} normals zero on one side only"
-        if not self.normal <= 1:
-            return f"normals differ by {self.normal:.1e} of what is allowed"
-        return None
-
-
 def some_samples(surface, rng, count):
     """Half-edges that name elements, and parameters: inside, on edges, near corners and at them.
 
@@ -235,8 +208,11 @@ def is_convention(surface, half_edge, samples):
     return (samples.level == AT_EXTRAORDINARY_POINT) & sharp[t.face_vertices[half_edge]]
 
 
-def differences_to_refined(surface, rng, count=24):
-    """Compare a surface with that of the cage refined once, at the same points."""
+def difference_to_refined(surface, rng, count=24):
+    """What is wrong with samples beside those of the surface of the cage refined once, at the same points.
+
+    Returns nothing where they agree; and how many normals are zero.
+    """
     topology, scheme = surface.patches.topology, surface.scheme
     finer = refined(surface)
     half_edge, uv = some_samples(surface, rng, count)
@@ -255,12 +231,22 @@ def differences_to_refined(surface, rng, count=24):
     size = np.ptp(surface.cage.positions, axis=0).max()
     with np.errstate(divide="ignore", invalid="ignore"):
         left = np.where(longer > 0, product / (longer * np.maximum(longer, size)), 0)
-        allowed = NORMAL + TANGENT / left
-        angle = np.linalg.norm(here.n - there.n, axis=1) / allowed
-    both = unit.all(axis=0) & ~is_convention(surface, half_edge, here)
-    unlike = (zero[0] != zero[1]) & (left > FADING) & ~is_convention(surface, half_edge, here)
-    point, normal = np.abs(here.p - there.p).max(), angle[both].max(initial=0)
-    return Differences(point, normal, int(zero.sum()), int(unit.sum()), 2 * count, int(unlike.sum()))
+        # Of what is allowed.
+        angle = np.linalg.norm(here.n - there.n, axis=1) / (NORMAL + TANGENT / left)
+    is_comparable = ~is_convention(surface, half_edge, here)
+    point, normal = np.abs(here.p - there.p).max(), angle[unit.all(axis=0) & is_comparable].max(initial=0)
+    # One normal is zero and the other is not, though tangents are far from parallel.
+    unlike = np.count_nonzero((zero[0] != zero[1]) & (left > FADING) & is_comparable)
+    problem = None
+    if not point <= POINT:
+        problem = f"points differ by {point:.1e}"
+    elif not (zero | unit).all():
+        problem = f"{np.count_nonzero(~(zero | unit))} normals neither unit nor zero"
+    elif unlike:
+        problem = f"{unlike} normals zero on one side only"
+    elif not normal <= 1:
+        problem = f"normals differ by {normal:.1e} of what is allowed"
+    return problem, np.count_nonzero(zero)
 
 
 # Share of the cages whose whole surface is tessellated, too.
@@ -281,7 +267,7 @@ def tessellation_problem(surface):
 
 
 def outcome(seed):
-    """What one random cage shows: "ok", "refused ..", or what is wrong; and its differences."""
+    """What one random cage shows: "ok", "refused ..", or what is wrong; and how many normals are zero, if compared."""
     rng = np.random.default_rng(seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CageWarning)
@@ -291,11 +277,10 @@ def outcome(seed):
             return "refused as a cage", None
         except SchemeError:
             return "refused by the scheme", None
-        differences = differences_to_refined(surface, rng)
-        problem = differences.problem
+        problem, zero_count = difference_to_refined(surface, rng)
         if problem is None and rng.random() < TESSELLATED:
             problem = tessellation_problem(surface)
-    return problem or "ok", differences
+    return problem or "ok", zero_count
 
 
 def main():
