@@ -388,7 +388,7 @@ def surfaces(scene):
 
 @exact
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
-def test_a_still_picture_is_exact_with_outlines_for_its_camera(path, capfd):
+def test_still_pictures_are_exact_with_outlines_for_their_camera_and_others_follow_none(path, capfd):
     scene = msub.usd_scene(path, mi, size=(1280, 960))
     alone, grouped = surfaces(scene)
     assert {entry["shading"] for entry in (*alone, *grouped)} == {"exact"}
@@ -400,11 +400,6 @@ def test_a_still_picture_is_exact_with_outlines_for_its_camera(path, capfd):
     for given in ({"tessellation_rate": 3}, {"shading": "vertex"}):
         alone, _ = surfaces(msub.usd_scene(path, mi, **given))
         assert all(entry.items() >= given.items() and "tessellation" not in entry for entry in alone)
-
-
-@exact
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
-def test_frames_and_saved_scenes_follow_no_sensor(path):
     for shown in (
         StillPicture(StageScenes(path, LOOK, {}), follows_sensor=False),
         Turntable(StageScenes(path, LOOK, {}), 2),
