@@ -228,14 +228,18 @@ def test_colours_and_texture_coordinates_of_some_corners_are_left_out_with_a_war
     np.testing.assert_array_equal(cage.positions[:3], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
 
 
-def test_names_of_materials_may_have_a_number_sign(tmp_path):
+def test_names_of_materials_may_have_a_number_sign(obj_file):
     # Quadrilaterals side by side.
-    quads = "".join(f"v {i} 0 0 # {i}\nv {i} 1 0\n" for i in range(6))
-    uses = ["usemtl a#1", "\tusemtl\tMaterial #25 # a comment", "# usemtl none", "usemtl plain # comment"]
-    uses += ["usemtl # none"]
-    faces = (f"{use}\nf {2 * i + 1} {2 * i + 3} {2 * i + 4} {2 * i + 2}\n" for i, use in enumerate(uses))
-    (tmp_path / "a.obj").write_text(quads + "".join(faces))
-    materials = ControlCage.from_file(tmp_path / "a.obj").materials
+    text = "".join(f"v {i} 0 0 # {i}\nv {i} 1 0\n" for i in range(6))
+    uses = [
+        "usemtl a#1",
+        "\tusemtl\tMaterial #25 # a comment",
+        "# usemtl none",
+        "usemtl plain # comment",
+        "usemtl # none",
+    ]
+    text += "".join(f"{use}\nf {2 * i + 1} {2 * i + 3} {2 * i + 4} {2 * i + 2}\n" for i, use in enumerate(uses))
+    materials = ControlCage.from_file(obj_file(text)).materials
     expected = {"a#1": [0], "Material #25": [1, 2], "plain": [3], "": [4]}
     assert {name: faces.tolist() for name, faces in materials.items()} == expected
 

@@ -77,9 +77,14 @@ RULE_TOKENS = [
 
 
 @pytest.mark.parametrize(("name", "rule", "tokens"), RULE_TOKENS)
-def test_rules_have_the_names_of_tokens_in_snake_case(read, name, rule, tokens):
+def test_rules_have_the_names_of_tokens_in_snake_case_and_arguments_override_them(read, name, rule, tokens):
     for token in tokens:
         assert getattr(read(f"{name} = '{token}'"), rule) == re.sub("([A-Z])", r"_\1", token).lower()
+    if rule != "scheme":
+        assert getattr(read(f"{name} = '{tokens[0]}'", **{rule: RULES[rule][1]}), rule) == RULES[rule][1]
+    with pytest.warns(CageWarning, match='subdivisionScheme is "catmullClark"; the scheme "doo_sabin" is used'):
+        assert read(scheme="doo_sabin").scheme == "doo_sabin"
+    assert read(scheme="catmull_clark").scheme == "catmull_clark"
 
 
 def test_contents_that_name_no_rules_are_written_with_the_usual_ones(tmp_path):
@@ -229,13 +234,6 @@ def test_meshes_are_read_at_the_first_time_with_points_and_faces(read, points):
     np.testing.assert_array_equal(cage.attributes["w"].values[:, 0], np.arange(6))
 
 
-def test_an_argument_overrides_what_the_mesh_asks_for_and_another_scheme_is_a_warning(read):
-    assert read("token interpolateBoundary = 'none'", boundary="edge_only").boundary == "edge_only"
-    with pytest.warns(CageWarning, match='subdivisionScheme is "catmullClark"; the scheme "doo_sabin" is used'):
-        assert read(scheme="doo_sabin").scheme == "doo_sabin"
-    assert read(scheme="catmull_clark").scheme == "catmull_clark"
-
-
 @pytest.mark.parametrize("scheme", ["none", "bilinear"])
 def test_meshes_that_are_not_to_be_smoothed_are_errors_unless_there_are_others(read, scheme):
     line = f"uniform token subdivisionScheme = '{scheme}'"
@@ -268,13 +266,11 @@ def test_one_of_several_meshes_is_chosen_by_its_path(read):
     ):
         with pytest.raises(CageError, match=message):
             read(more=more, prim=path)
-
-
-def test_meshes_of_instances(read):
+    # Of an instance.
     more = 'class "Model" {' + TRIANGLE.format("part") + "}\n"
     more += prim("Xform", "a", moved(translate=(5, 0, 0)), head="instanceable = true\ninherits = </World/Model>")
-    cage = read(more=more, prim="/World/a/part")
-    np.testing.assert_array_equal(cage.positions, [[5, 0, 0], [6, 0, 0], [5, 1, 0]])
+    positions = read(more=more, prim="/World/a/part").positions
+    np.testing.assert_array_equal(positions, [[5, 0, 0], [6, 0, 0], [5, 1, 0]])
 
 
 COUNTS, INDEXED_ST = "int[] faceVertexCounts = [4, 4]", UV.format("st")
@@ -388,12 +384,11 @@ def test_malformed_files_and_those_without_meshes_name_the_file(tmp_path, suffix
 
 
 def test_syntax_errors_name_their_line_and_a_file_of_this_folder_by_its_name(read, tmp_path, monkeypatch):
-    with pytest.raises(CageError, match=r"""cage\.usda", line 5: .*; expected a USD file""") as caught:
+    with pytest.raises(CageError, match=r'cage\.usda", line 5: .*; expected a USD file'):
         read(old="(2, 0, 0), (0, 1, 0)", new="(2, 0, 0; (0, 1, 0)")
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(CageError, match=r"""^"cage\.usda", line 5: """) as caught_here:
+    with pytest.raises(CageError, match=r'^"cage\.usda", line 5: (?!.*pxr)'):
         ControlCage.from_file("cage.usda")
-    assert "pxr" not in f"{caught.value} {caught_here.value}"
 
 
 def test_missing_references_are_a_warning(read):
@@ -473,13 +468,11 @@ def test_the_surface_of_joined_meshes_is_that_of_each(read_all):
             values, expected = (whole.evaluate_attribute(data, element, uv), alone.evaluate_attribute(data, face, uv))
             # Alone they may be cut apart at every edge, and are linear then.
             np.testing.assert_allclose(values, expected, rtol=0, atol=ROUNDING)
-
-
-def test_one_mesh_is_joined_to_none_and_a_mesh_among_others_is_still_an_error(read_all):
     cage = read_all(STRIP)
     assert (cage.source.name.partition("prim ")[2], cage.face_count) == ("/sheet", 2)
-    message = r'there are 2 meshes; expected prim to name one of /sheet, /house, or "\*" for'
-    with pytest.raises(CageError, match=message):
+    with pytest.raises(
+        CageError, match=r'there are 2 meshes; expected prim to name one of /sheet, /house, or "\*" for'
+    ):
         read_all(STRIP, HOUSE, prim=None)
 
 
