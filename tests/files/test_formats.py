@@ -133,18 +133,19 @@ def with_all_data(cage, suffix, number, rng):
 
 @pytest.mark.core
 @pytest.mark.parametrize("suffix", [".OBJ", ".ply", *USD])
-def test_what_is_saved_is_read_back(any_cage, suffix, tmp_path, np_rng):
+def test_what_is_saved_is_read_back(any_cage, suffix, request, tmp_path, np_rng):
     """Bit by bit, with every rule that tags of OBJ and tokens of USD stand for; what was there is replaced."""
     skip_without_package(suffix)
-    path = tmp_path / f"cage{suffix}"
-    for number in range(1, 1 + {".OBJ": 6, ".ply": 3, ".usda": 6}.get(suffix, 1)):
-        *arrays, data = with_all_data(any_cage, suffix, number, np_rng)
-        chosen = {rule: values[number % len(values)] for rule, values in RULES.items()} if suffix != ".ply" else {}
-        if suffix in USD:
-            chosen["crease_method"] = "uniform"
-        cage = ControlCage.from_arrays(*arrays, **data, **chosen)
-        cage.save(path)
-        again = ControlCage.from_file(str(path) if number == 1 else path)
+    number = request.node.callspec.indices["any_cage"]
+    *arrays, data = with_all_data(any_cage, suffix, number, np_rng)
+    rules = {rule: values[number % len(values)] for rule, values in RULES.items() if suffix != ".ply"}
+    if suffix in USD:
+        rules["crease_method"] = "uniform"
+    path, cage = tmp_path / f"cage{suffix}", ControlCage.from_arrays(*arrays, **data, **rules)
+    any_cage.save(path)
+    cage.save(path)
+    for given in (path, str(path)):
+        again = ControlCage.from_file(given)
         assert same(again.contents, cage.contents)
         assert suffix in USD or list(again.attributes) == list(cage.attributes)
         assert again.source.name.startswith(f'"{path}"')
