@@ -235,7 +235,7 @@ def test_tiles_do_not_depend_on_the_blocks_that_bound_their_memory(monkeypatch):
             sizes.append(len(part.tiles))
             yield part
 
-    monkeypatch.setattr(adaptive, "MOST_WAITING", 2 * most)
+    monkeypatch.setattr(adaptive, "PARTS_AT_ONCE", 2)
     monkeypatch.setattr(adaptive, "TILES_AT_ONCE", most)
     monkeypatch.setattr(adaptive, "_whole_patches", counted)
     np.testing.assert_array_equal(table_of(surface, 1e-2, 64).triangles, whole)

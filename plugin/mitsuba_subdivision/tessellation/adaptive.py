@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from itertools import chain
+from collections.abc import Iterator
+from itertools import islice
 
 import numpy as np
 
@@ -24,9 +24,9 @@ from .tile_rates import Part, TileRates, feature_edges
 from .uniform import checked_rate
 from .vertex_table import VertexPolynomials, VertexRuns, VertexTable, vertex_polynomials
 
-# Tiles of a kind that are processed together, whose bounds stay in a core's cache; and most tiles that wait for more of
-# their kind. Both bound temporary memory; smaller numbers would take more time.
-TILES_AT_ONCE, MOST_WAITING = 1 << 10, 1 << 15
+# Tiles of a kind that are processed together, whose bounds stay in a core's cache; and parts of as many patches, which
+# are divided together. Both bound temporary memory; smaller numbers would take more time.
+TILES_AT_ONCE, PARTS_AT_ONCE = 1 << 10, 1 << 7
 
 
 def adaptive_table(
@@ -133,24 +133,20 @@ def _whole_patches(patches: PatchTable, rates: TileRates, points: FloatArray) ->
             yield Part(kind, block, values if rows is identity else times(rows, values))
 
 
-def _divided(rates: TileRates, patches: Iterable[Part]) -> Iterator[Tiles]:
+def _divided(rates: TileRates, patches: Iterator[Part]) -> Iterator[Tiles]:
     """Iterate over the tiles of all patches, with their rates. Raises MemoryError if there are too many triangles."""
     # Tiles wait by kind, as one call bounds many tiles of a kind in little more time than one of them.
     waiting: dict[DividedTile, list[Part]] = {}
-    triangle_count = waiting_count = 0
+    triangle_count = 0
 
     def priority(kind: DividedTile) -> int:
         # Pieces, which are all of one kind, wait until there are enough of them. Larger tiles come before few pieces,
         # to detect too many triangles early.
         return 1 if not kind.is_piece else 2 * (sum(len(part.tiles) for part in waiting[kind]) > TILES_AT_ONCE)
 
-    for part in chain(patches, [None]):
-        if part is not None:
+    while parts := list(islice(patches, PARTS_AT_ONCE)):
+        for part in parts:
             waiting.setdefault(part.kind, []).append(part)
-            waiting_count += len(part.tiles)
-            if waiting_count < MOST_WAITING:
-                continue
-        waiting_count = 0
         while waiting:
             kind = max(waiting, key=priority)
             taken = _taken(waiting[kind])

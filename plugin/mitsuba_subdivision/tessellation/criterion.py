@@ -36,8 +36,6 @@ BESIDE_OUTLINE = np.radians(4)
 TINY = sys.float_info.min
 # Excess over an integer that counts as rounding error and does not round a rate up.
 RATE_ROUNDING = 1e-9
-# Rates that `least_product` tries, relative to the integer below the best real number.
-TRIED = (-1, 0, 1)
 # Upper limit of rates, above any that is used.
 MOST = 1 << 20
 # Directions whose sine is below this are parallel.
@@ -93,25 +91,14 @@ class DisplacementBound:
 
 @dataclass(frozen=True, eq=False)
 class Criterion:
-    """An error limit for all triangles of a tessellation. Raises ValueError if the error is negative or not a number.
-
-    Attributes
-    ----------
-    error : float
-        The limit, in pixels of the ``sensor`` if there is one.
-    sensor : Sensor or None
-        Sensor in whose pixels the error is measured.
-    outline : Sensor or None
-        Triangles that this sensor cannot see edge-on, and that are hence at no silhouette, may be coarse.
-    displacement : DisplacementBound or None
-        Displacement of the surface, at whose samples the limit is checked.
-    """
+    """An error limit for all triangles of a tessellation. Raises ValueError if it is negative or not a number."""
 
     measure: Measure
-    error: float
+    error: float  # The limit, in pixels of the ``sensor`` if there is one
     sensor: Sensor | None = None
+    # Triangles that this sensor cannot see edge-on, and that are hence at no silhouette, may be coarse.
     outline: Sensor | None = None
-    displacement: DisplacementBound | None = None
+    displacement: DisplacementBound | None = None  # At whose samples the limit is checked
 
     def __post_init__(self) -> None:
         if not self.error >= 0:
@@ -147,13 +134,21 @@ class Criterion:
 
         Heights that are not numbers lie outside a triangle, and do not count.
         """
-        steps = len(heights) - 1
+        steps, is_triangle = len(heights) - 1, corner_count == 3
         u, v = (steps * np.diff(heights, axis=axis) for axis in (1, 0))
-        if self.measure is Measure.EDGE:
-            form = _edge_heights(u, v, corner_count)
+        if self.measure is Measure.EDGE and is_triangle:
+            u, v = u[:-1], v[:, :-1]
+            form = _isotropic(4 * np.nanmax(np.square([u, v, u - v]), axis=(0, 1, 2)))
+        elif self.measure is Measure.EDGE:
+            a, c = (np.abs(d).max(axis=(0, 1)) for d in (u, v))
+            form = np.stack([a**2, a * c, c**2])
         else:
             uu, uv, vv = (steps * np.diff(first, axis=axis) for first, axis in ((u, 1), (u, 0), (v, 0)))
-            form = _chord_heights(uu, uv, vv, corner_count)
+            if is_triangle:
+                mean, cosine, sine = _by_angle(uu[:-2], uv[:-1, :-1], vv[:, :-2])
+                form = _isotropic(TRIANGLE_ERROR * np.nanmax(np.abs(mean) + np.hypot(cosine, sine), axis=(0, 1)))
+            else:
+                form = SQUARE_ERROR * np.stack([np.abs(d).max(axis=(0, 1)) for d in (uu, uv, vv)])
         return self._relative(form, self.limit(points.min(axis=0), points.max(axis=0)))
 
     def _relative(self, form: FloatArray, limit: FloatArray) -> FloatArray:
@@ -199,23 +194,6 @@ def _chord_form(second: list[FloatArray], shortest: FloatArray, normals: Cone, c
     return SQUARE_ERROR * np.stack(sizes)
 
 
-def _edge_heights(u: FloatArray, v: FloatArray, corner_count: int) -> FloatArray:
-    """As `_edge_form`, from first differences ``(n, n - 1, t)`` and ``(n - 1, n, t)`` of heights."""
-    if corner_count == 3:
-        u, v = u[:-1], v[:, :-1]
-        return _isotropic(4 * np.nanmax(np.square([u, v, u - v]), axis=(0, 1, 2)))
-    a, c = (np.abs(d).max(axis=(0, 1)) for d in (u, v))
-    return np.stack([a**2, a * c, c**2])
-
-
-def _chord_heights(uu: FloatArray, uv: FloatArray, vv: FloatArray, corner_count: int) -> FloatArray:
-    """As `_chord_form`, from second differences ``(n, n - 2, t)``, ``(n - 1, n - 1, t)`` and ``(n - 2, n, t)``."""
-    if corner_count == 3:
-        mean, cosine, sine = _by_angle(uu[:-2], uv[:-1, :-1], vv[:, :-2])
-        return _isotropic(TRIANGLE_ERROR * np.nanmax(np.abs(mean) + np.hypot(cosine, sine), axis=(0, 1)))
-    return SQUARE_ERROR * np.stack([np.abs(d).max(axis=(0, 1)) for d in (uu, uv, vv)])
-
-
 def _by_angle(uu: FloatArray, uv: FloatArray, vv: FloatArray) -> list[FloatArray]:
     """The second derivative along a direction in an equilateral triangle, by the direction's angle.
 
@@ -240,10 +218,10 @@ def least_product(
     forms = np.minimum(forms, MOST)
     # Where A and C vanish, the quotient below must not overflow.
     a, b, c = np.maximum(forms.max(axis=0), 1e-100)
-    # The real rates of least product satisfy A / n_u^2 = C / n_v^2.
+    # The real rates of least product satisfy A / n_u^2 = C / n_v^2. Integers beside these are tried.
     rate = np.sqrt(2 + 2 * b / (np.sqrt(a) * np.sqrt(c)))
     tried = []
-    for offset in TRIED:
+    for offset in (-1, 0, 1):
         tried.append(_with_other(forms, np.floor(rate * np.sqrt(a)) + offset))
         tried.append(_with_other(forms[:, ::-1], np.floor(rate * np.sqrt(c)) + offset)[:, ::-1])
     candidates = np.stack(tried)
@@ -274,15 +252,6 @@ def dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return products
 
 
-def cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """``(.., 3, t)`` cross products of vectors ``(.., 3, t)``."""
-    product = np.empty(np.broadcast_shapes(a.shape, b.shape), dtype=np.result_type(a, b))
-    for axis in range(3):
-        i, j = (axis + 1) % 3, (axis + 2) % 3
-        np.subtract(a[..., i, :] * b[..., j, :], a[..., j, :] * b[..., i, :], out=product[..., axis, :])
-    return product
-
-
 def unit(vectors: FloatArray) -> FloatArray:
     """``(.., 3, t)`` vectors divided by their lengths; zero vectors stay zero."""
     length = np.sqrt(dot(vectors, vectors))
@@ -306,7 +275,7 @@ def tangent_cone(derivative: FloatArray) -> tuple[Cone, FloatArray]:
 
 def normal_cone(u: Cone, v: Cone) -> Cone:
     """Cones of normals from cones of tangents along u and v [Sederberg and Meyers 1988]."""
-    normal = cross(u.axis, v.axis)
+    normal = np.cross(u.axis, v.axis, axis=-2)
     sine, cosine = np.sqrt(dot(normal, normal)), np.abs(dot(u.axis, v.axis))
     safe = np.maximum(sine, PARALLEL)
     normal_sine = np.sqrt(u.sine**2 + 2 * u.sine * v.sine * cosine + v.sine**2) / safe

@@ -22,7 +22,6 @@ from .criterion import (
     Criterion,
     Measure,
     cone_around,
-    cross,
     dot,
     least_product,
     normal_cone,
@@ -136,7 +135,10 @@ class TileRates:
         # Tiles that fit into the limit as a whole: the only test for tiles that are folded or have no normal.
         fits = (np.linalg.norm(upper - lower, axis=0) <= limit) & self.scheme.has_convex_rules
         # Across the tile: orthogonal to both diagonals of a quadrilateral, or to two sides of a triangle.
-        axis, extent = unit(cross(corners[2] - corners[0], corners[-1] - corners[1])), np.full(len(tiles), np.inf)
+        axis, extent = (
+            unit(np.cross(corners[2] - corners[0], corners[-1] - corners[1], axis=0)),
+            np.full(len(tiles), np.inf),
+        )
         is_flat, has_axis = fits.copy(), axis.any(axis=0)
         for hull in kind.hulls:
             tested = np.flatnonzero(~is_flat & has_axis)
@@ -242,8 +244,8 @@ def _normals_to(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
     direction = unit(vectors)
     direction = np.where(dot(direction, direction) > 0, direction, np.array([[0.0], [0], [1]]))
     # The first is orthogonal to the axis along which the direction is smallest.
-    first = unit(cross(direction, np.eye(3)[np.argmin(np.abs(direction), axis=0)].T))
-    return first, cross(direction, first)
+    first = unit(np.cross(direction, np.eye(3)[np.argmin(np.abs(direction), axis=0)].T, axis=0))
+    return first, np.cross(direction, first, axis=0)
 
 
 @lru_cache(maxsize=16)
