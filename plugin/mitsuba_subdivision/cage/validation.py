@@ -85,11 +85,10 @@ def validated_faces(
     have no twin, and vertices may have several fans; non-manifold edges and vertices, None for a manifold; and, if
     faces were turned over, (n_h,) int64, the given face corner of each face corner of the topology.
     """
-    flat_sizes, flat_vertices = _flat(face_sizes, "face_sizes", source), _flat(face_vertices, "face_vertices", source)
-    sizes = _integers(flat_sizes, "face_sizes", source)
-    _check_sizes(sizes, len(flat_vertices), source)
+    sizes = _integers(face_sizes, "face_sizes", source)
+    vertices = _integers(face_vertices, "face_vertices", source, sizes)
+    _check_sizes(sizes, len(vertices), source)
     sizes = sizes.astype(np.int64)
-    vertices = _integers(flat_vertices, "face_vertices", source, sizes)
     require_vertices(vertex_count, sizes, vertices, source)
     vertices = np.array(vertices, dtype=np.int32)
     if (sizes == sizes[0]).all():
@@ -192,7 +191,7 @@ def validated_holes(topology: Topology, holes: ArrayLike, source: CageSource) ->
 
 def validated_face_indices(topology: Topology, indices: ArrayLike, noun: str, source: CageSource) -> IntArray:
     """Check 0-based faces, and return them sorted, without repetitions. Messages call a face ``noun``."""
-    faces = _integers(_flat(indices, f"{noun}s", source), f"{noun}s", source)
+    faces = _integers(indices, f"{noun}s", source)
     for row in np.flatnonzero((faces < 0) | (faces >= topology.face_count))[:1]:
         raise CageError(
             f"{source.at_tag(f'{noun}s', row)}: {noun} {int(faces[row]) + source.index_base} is no face; expected one "
@@ -219,18 +218,14 @@ def read_only(array: NDArray) -> NDArray:
     return array
 
 
-def _flat(values: ArrayLike, name: str, source: CageSource) -> NDArray:
-    array = np.asarray(values)
-    if array.ndim != 1:
-        raise CageError(f"{source.name}: {name} has shape {array.shape}; expected a flat array of integers")
-    return array
-
-
-def _integers(array: NDArray, name: str, source: CageSource, sizes: IntArray | None = None) -> NDArray[np.integer]:
-    """Check that an array has an integer type, and return it.
+def _integers(values: ArrayLike, name: str, source: CageSource, sizes: IntArray | None = None) -> NDArray[np.integer]:
+    """Check that values are a flat array of an integer type, and return it.
 
     If the values are vertices of faces, ``sizes`` are the face sizes, to name the first invalid face.
     """
+    array = np.asarray(values)
+    if array.ndim != 1:
+        raise CageError(f"{source.name}: {name} has shape {array.shape}; expected a flat array of integers")
     if array.dtype.kind in "iu":
         return array
     if array.size == 0:

@@ -74,10 +74,9 @@ def eigenbasis(
 ) -> Eigenbasis:
     """Compute the eigenbasis of a subdivision matrix.
 
-    ``numpy.linalg.eig`` alone is not enough. Rounding turns a repeated eigenvalue into a conjugate pair, whose vectors
-    have equal real parts, and the vectors of a defective eigenvalue come out nearly parallel. So close eigenvalues are
-    grouped into clusters. The basis consists of an orthonormal basis of each cluster's invariant subspace, computed by
-    inverse iteration where the eigenvectors are dependent. In this basis the matrix is block-diagonal.
+    ``numpy.linalg.eig`` alone is not enough, see section 6 of plugin/MATHEMATICS.md. So close eigenvalues are grouped
+    into clusters. The basis consists of an orthonormal basis of each cluster's invariant subspace, computed by inverse
+    iteration where the eigenvectors are dependent. In this basis the matrix is block-diagonal.
 
     Raises EigenbasisError if the second eigenvalue is not below one, distinct eigenvalues are too close to separate
     their vectors, or one of ``A V = V T``, ``L V = 1`` and ``A^20 = V T^20 L`` does not hold to 1e-10.

@@ -332,11 +332,8 @@ class PieceKernel:
     def first_term(self, s: Float, t: Float) -> list[Float]:
         """Rounding errors of the first terms of (9) and (11), which (10) and (12) avoid.
 
-        All components of the first eigenvector are one. So the first term of the point is ``ĉ_1`` times the sum of the
-        basis functions, which is one; those of the derivatives are ``2ⁿ⁺¹ ĉ_1`` times the sums of the derivatives of
-        the basis functions, which are zero. In single precision, both sums have rounding errors.
-
-        Returns the factors of the point ``ĉ_1`` in the errors of the point and of its derivatives by s and t.
+        They are those of the sums of the basis functions and of their derivatives. Returns the factors of the point
+        ``ĉ_1`` in the errors of the point and of its derivatives by s and t.
         """
         functions = (
             self.monomials.values([s * 0 + x for x in coefficients], s, t)

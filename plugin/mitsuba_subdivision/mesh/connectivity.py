@@ -1,9 +1,7 @@
 """Half-edge connectivity of polygon meshes, built by sorting, and the semi-sharp edges and vertices of a mesh.
 
 Sharpness is infinite from 10; below, it lasts for a number of refinements (semi-sharp). `Sharpness` (`cuts`) has that
-of the control cage, from its tags, including infinite sharpness. `SemiSharpness` has that of a mesh that is cut along
-its infinitely sharp edges, where only finite sharpness remains. A `Fan` of a signature has that around one vertex, from
-which `joined_rings` makes a `SemiSharpness` of the local mesh.
+of the tags of a control cage. `SemiSharpness` has that of a mesh that is cut along its infinitely sharp edges.
 """
 
 from __future__ import annotations

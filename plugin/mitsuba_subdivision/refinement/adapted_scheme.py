@@ -41,11 +41,8 @@ def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
 
 def _with_rules_of(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
     chosen = chosen or cage.scheme or "catmull_clark"
-    if isinstance(chosen, str):
-        scheme = scheme_named(chosen)
-    else:
-        scheme = chosen
-        require_scheme(scheme)
+    scheme = scheme_named(chosen) if isinstance(chosen, str) else chosen
+    require_scheme(scheme)
     if cage.scheme not in (None, scheme.name):
         warn(f'{cage.source.name}: asks for the scheme "{cage.scheme}"; "{scheme.name}" is used')
     cut = cage.cut_mesh.topology
@@ -62,13 +59,10 @@ def _with_rules_of(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
     for feature, is_lacking in lacking.items():
         if is_lacking:
             raise SchemeError(f"{cage.source.name}: the scheme {scheme.name} has no rules for {feature}")
-    has_triangles = bool((cage.face_sizes == 3).any())
+    has_triangles = scheme.domain.corner_count == 4 and (cage.face_sizes == 3).any()
+    triangle_rule = cage.triangle_rule if has_triangles else "catmull_clark"
     try:
-        return with_rules(
-            scheme,
-            cage.crease_method if semi_sharp else "uniform",
-            cage.triangle_rule if has_triangles and scheme.domain.corner_count == 4 else "catmull_clark",
-        )
+        return with_rules(scheme, cage.crease_method if semi_sharp else "uniform", triangle_rule)
     except SchemeError as error:
         raise SchemeError(f"{cage.source.name}: {error}") from None
 

@@ -284,14 +284,8 @@ def with_rules(scheme: Scheme, crease_method: str, triangle_rule: str) -> Scheme
     SchemeError
         If the scheme does not support the rules. Only Catmull-Clark has another rule for triangles.
     """
-    changed = {
-        name: rule
-        for name, rule, default in (
-            ("crease_method", crease_method, "uniform"),
-            ("triangle_rule", triangle_rule, "catmull_clark"),
-        )
-        if rule != (getattr(scheme, name) or default)
-    }
+    rules = {"crease_method": (crease_method, "uniform"), "triangle_rule": (triangle_rule, "catmull_clark")}
+    changed = {name: rule for name, (rule, default) in rules.items() if rule != (getattr(scheme, name) or default)}
     for name, rule in changed.items():
         if getattr(scheme, name) is None:
             raise SchemeError(f'the scheme {scheme.name} has no {name} "{rule}"')
