@@ -10,7 +10,7 @@ from mitsuba_subdivision.schemes import CatmullClark, DooSabin, Loop, Refinement
 from mitsuba_subdivision.schemes.domain import SQUARE
 from mitsuba_subdivision.schemes.scheme import PhantomPoint, tensor_basis
 from patches.closed_cages import extraordinary_triangles
-from reference.refined_cages import refined, sheet, tagged
+from reference.refined_cages import sheet, tagged
 
 # Rounding over some levels of refinement of the unit ball.
 POINT = 1e-12
@@ -74,15 +74,14 @@ def known(monkeypatch):
 def test_a_users_scheme_is_known_by_its_name_and_exact():
     register_scheme(Warren())
     cage = extraordinary_triangles(5, rows=2)
-    surface = LimitSurface(cage, "warren")
-    limit = surface.tessellate(1).positions
-    finer, errors = surface, []
+    limit, errors = LimitSurface(cage, "warren").tessellate(1).positions, []
+    finer = cage
     for level in range(5):
-        finer = refined(finer)
-        errors.append(np.abs(finer.cage.positions[: cage.vertex_count] - limit).max())
+        finer = finer.refined("warren")
+        errors.append(np.abs(finer.positions[: cage.vertex_count] - limit).max())
         # One refinement of the whole mesh has the same surface.
         if level == 0:
-            assert np.abs(finer.tessellate(1).positions[: cage.vertex_count] - limit).max() < POINT
+            assert np.abs(LimitSurface(finer).tessellate(1).positions[: cage.vertex_count] - limit).max() < POINT
     # Vertices approach the limit by a factor of about 4 a level.
     assert errors[4] < errors[2] / 10 < 1e-3
     assert np.abs(limit - LimitSurface(cage, "loop").tessellate(1).positions).max() > 1e-3

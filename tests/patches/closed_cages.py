@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 from mitsuba_subdivision.cage import CageSource, ControlCage, named_cages
+from mitsuba_subdivision.schemes import Loop
 
 
 def torus(columns, rows, major_radius=2.0, minor_radius=1.0):
@@ -31,39 +32,19 @@ def tetrahedron():
 
 
 def extraordinary_triangles(valence, rows=4):
-    """Ball of triangles, a double pyramid, with poles of this valence, isolated with 4 rows or more.
+    """Ball of triangles, a double pyramid split to 2 or 4 rows, with poles of this valence, isolated with 4 rows.
 
     Vertex 0 is the pole at (0, 0, 1). Faces 0 to ``valence - 1`` are its one-ring, counter-clockwise, and each begins
     at it. The corners of the pyramids' polygon have valence 4, all other vertices 6.
     """
-    # Circle r of the upper half has r vertices per sector; circle 0 is the pole. Triangles are sorted by circle, so
-    # that those of the pole come first.
-    circle, sector, step = np.indices((rows, valence, rows)).reshape(3, -1)
-    inner, outer = sector * circle + step, sector * (circle + 1) + step
-    up = np.array([(circle, inner), (circle + 1, outer), (circle + 1, outer + 1)])
-    down = np.array([(circle, inner), (circle + 1, outer + 1), (circle, inner + 1)])
-    corners = np.concatenate([up[..., step <= circle], down[..., step < circle]], axis=2)
-    around = corners[:, 1] % np.maximum(valence * corners[:, 0], 1)
-    vertices, number = np.unique(valence * rows * corners[:, 0] + around, return_inverse=True)
-    faces = number.reshape(3, -1).T
-
-    circle, around = np.divmod(vertices, valence * rows)
-    # Interpolate along the sector's side of the polygon, then project to the sphere.
-    side, along = np.divmod(around, np.maximum(circle, 1))
-    angle = 2 * np.pi / valence * np.stack([side, side + 1])
-    weight = np.stack([1 - along / np.maximum(circle, 1), along / np.maximum(circle, 1)])
-    flat = np.stack([(weight * np.cos(angle)).sum(axis=0), (weight * np.sin(angle)).sum(axis=0)], axis=1)
-    radius = np.sin(np.pi / 2 * circle / rows)[:, None]
-    ring = radius * flat / np.linalg.norm(flat, axis=1, keepdims=True)
-    upper = np.concatenate([ring, np.sqrt(1 - radius**2)], axis=1)
-    # The equator is shared; the lower half has mirrored copies of the other vertices.
-    below = len(upper) - valence * rows
-    lower_number = np.concatenate([len(upper) + np.arange(below), np.arange(below, len(upper))])
-    return ControlCage(
-        np.concatenate([upper, upper[:below] * [1, 1, -1]]),
-        np.concatenate([faces, lower_number[faces[:, ::-1]]]),
-        source=CageSource(f"extraordinary_triangles({valence})"),
-    )
+    t, points = bipyramid(valence).topology, bipyramid(valence).positions
+    for _ in range(rows // 2):
+        middles = points[t.face_vertices[t.edge_half_edge]] + points[t.face_vertices[t.next[t.edge_half_edge]]]
+        points = np.concatenate([points, middles / np.linalg.norm(middles, axis=1, keepdims=True)])
+        t = Loop().refine(t).topology
+    faces = t.face_vertices.reshape(-1, 3)
+    source = CageSource(f"extraordinary_triangles({valence})")
+    return ControlCage(points, faces[np.argsort(faces[:, 0] != 0, kind="stable")], source=source)
 
 
 def extraordinary_face(corners):

@@ -32,7 +32,7 @@ CAGES = {
     "creased": lambda: with_attributes(cube(creases=RING)),
     "mixed": lambda: with_attributes(cube_with_hexagon()),
     "refined": lambda: with_attributes(cube_with_hexagon()),
-    "loop": lambda: with_attributes(extraordinary_triangles(5)),
+    "loop": lambda: with_attributes(extraordinary_triangles(7)),
     "doo_sabin": lambda: cube(texcoords=TEXCOORDS, attributes=SMOOTH),
 }
 PLACED, VALUES = ("control_points", "to_world"), ("cage_texcoords", "cage_colour", "cage_weight", "cage_label")

@@ -2,34 +2,19 @@
 
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.cage import Attribute
-from patches.closed_cages import bumpy, cube_with_valence_2, mixed_torus, prism, torus
+from mitsuba_subdivision import LimitSurface
+from patches.closed_cages import bumpy, cube_with_valence_2, mixed_torus, prism
+from peers.fidelity_cages import ISLANDS, SURFACES
 from reference.refined_cages import refine_first
+from tessellation.test_attribute_table import with_seams
 from tessellation.test_uniform import NORMAL, ROUNDING
-
-
-def tagged(cage, **options):
-    """With random creases and corners, semi-sharp and sharp ones, and a boundary, attributes and a seam."""
-    t, rng = cage.topology, np.random.default_rng(5)
-    kept = np.flatnonzero(t.face != t.face[0])
-    edges = t.edge_half_edge[t.face[t.edge_half_edge] != t.face[0]]
-    creased = edges[rng.random(len(edges)) < 0.15]
-    pairs = t.face_vertices[np.stack([creased, t.next[creased]])].T.tolist()
-    options["creases"] = [(a, b, float(rng.choice([0.6, 2, 10]))) for a, b in pairs]
-    options["corners"] = [(int(t.face_vertices[-1]), 3.5)]
-    indices = t.face_vertices[kept] + cage.vertex_count * (t.face[kept] % 5 == 0)
-    options["texcoords"] = Attribute(rng.random((2 * cage.vertex_count, 2)), "face_varying", indices)
-    options["attributes"] = {"heat": Attribute(rng.random((cage.vertex_count, 1)), "vertex")}
-    return ControlCage.from_arrays(cage.positions, cage.face_sizes[1:], t.face_vertices[kept], **options)
-
 
 CAGES = {
     "prism": prism(),
     "valence 2": cube_with_valence_2(beside_triangle=True),
-    "mixed torus": mixed_torus(),
-    "tagged torus": tagged(mixed_torus()),
-    "tagged quads": tagged(torus(7, 6), crease_method="chaikin"),
+    "mixed torus": with_seams(mixed_torus(), np.random.default_rng(5)),
+    "Chaikin": SURFACES["Chaikin, semi-sharp corner"],
+    **{name: ISLANDS[name] for name in ("semi-sharp crease, seam beside it, all", "corner in an island, none")},
 }
 
 
