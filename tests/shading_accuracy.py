@@ -18,7 +18,6 @@ import mitsuba_subdivision
 import mitsuba as mi
 import numpy as np
 from kernels.surfaces import CAGES
-from shapes.scenes import camera_rays, scene_with
 
 CAMERAS = {
     "human": ([0, -12, 8], [0, 0, 4]),
@@ -54,8 +53,12 @@ def main() -> None:
 def hits(name: str, rate: int, shading: str, resolution: int) -> dict[str, np.ndarray]:
     """What the rays hit: whether they do, points, normals and the rays' directions."""
     origin, target = CAMERAS[name]
+    to_world = mi.ScalarTransform4f().look_at(origin, target, [0, 0, 1])
     shape = {"type": "subdivision", "filename": str(CAGES / f"{name}.obj"), "tessellation_rate": rate}
-    scene, ray = scene_with(shape={**shape, "shading": shading}), camera_rays(resolution, origin, target)
+    sensor = {"type": "perspective", "to_world": to_world, "fov": 30}
+    scene = mi.load_dict({"type": "scene", "sensor": sensor, "shape": {**shape, "shading": shading}})
+    y, x = (np.indices((resolution, resolution)).reshape(2, -1) + 0.5) / resolution
+    ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, mi.Point2f(x, y), mi.Point2f(0.5))
     si = scene.ray_intersect(ray)
     box = scene.bbox()
     values = {"p": si.p, "n": si.sh_frame.n, "d": ray.d, "hit": si.is_valid(), "size": box.max - box.min}

@@ -240,14 +240,6 @@ def test_a_bowl_seen_from_inside_does_not_shade_itself():
 # Everything that a shape carries
 
 
-def test_a_bsdf_stays_the_users_own():
-    bsdf = mi.load_dict(matte())
-    vertex, exact = (mi.load_dict(make(cube(), shading=shading, bsdf=bsdf)) for shading in ("vertex", "exact"))
-    assert exact.bsdf() is vertex.bsdf() is bsdf
-    names = [{key for key in mi.traverse(shape).keys() if "bsdf" in key} for shape in (vertex, exact)]  # noqa: SIM118
-    assert names[0] == names[1] != set()
-
-
 def rgb(*value):
     return {"type": "rgb", "value": list(value)}
 

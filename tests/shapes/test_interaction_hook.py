@@ -4,8 +4,6 @@ import contextlib
 import gc
 import mmap
 import re
-import subprocess
-import sys
 import traceback
 import weakref
 
@@ -18,14 +16,15 @@ from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.shapes import exact_shading, interaction_hook, machine_code
 from reference.refined_cages import sheet
 from shapes.cages import described, load
-from shapes.scenes import down, perspective, rows, scene_with
-from shapes.variants import every_array_variant, llvm
+from shapes.scenes import down, hit, perspective, rows, scene_with
+from shapes.variants import every_array_variant, llvm, printed
 
 pytestmark = pytest.mark.threads
 
 if interaction_hook.hook_problem():
     pytest.skip(str(interaction_hook.hook_problem()), allow_module_level=True)
 
+# The cube's top, away from the triangles' corners.
 TOP = (0.13, 0.21, 4)
 
 
@@ -35,11 +34,6 @@ def cube(**parameters):
 
 def make(**parameters):
     return mi.load_dict(cube(**parameters))
-
-
-def interaction(shape):
-    """Of a ray that meets the cube's top away from the triangles' corners."""
-    return scene_with(shape=shape).ray_intersect(down(*TOP))
 
 
 class AnswerError(OSError):
@@ -76,31 +70,15 @@ def scene_of(shape, integrator="path"):
     return scene_with(integrator={"type": integrator}, sky={"type": "constant"}, sensor=sensor, shape=shape)
 
 
-def heat():
-    return upload(mi.TensorXf, np.arange(8.0)[:, None])
-
-
 BEGIN = """
-import mitsuba_subdivision as msub, mitsuba as mi, drjit as dr, numpy as np, signal
+import mitsuba_subdivision as msub, mitsuba as mi, drjit as dr
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.shapes import exact_shading
-# What runs in the background of a shell ignores interruptions otherwise.
-signal.signal(signal.SIGINT, signal.default_int_handler)
+mi.set_variant('llvm_ad_rgb')
 def shape(shading):
     cage = named_cages.cube().as_properties(mi)
     return {'type': 'subdivision', **cage, 'tessellation_rate': 2, 'shading': shading}
 """
-
-
-def program(code):
-    """Run a program in a process of its own, which may crash."""
-    return subprocess.run([sys.executable, "-c", BEGIN + code], capture_output=True, text=True, check=False)
-
-
-def printed(code):
-    done = program(f"mi.set_variant('llvm_ad_rgb')\n{code}")
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 # Errors
@@ -108,12 +86,12 @@ def printed(code):
 
 @every_array_variant
 def test_an_error_is_raised_by_what_caused_it_and_by_nothing_else(monkeypatch, capfd):
-    shape = make(vertex_heat=heat())
-    scene, si = scene_of(shape), interaction(shape)
+    shape = make(vertex_heat=upload(mi.TensorXf, np.arange(8.0)[:, None]))
+    scene, si = scene_of(shape), hit(shape, *TOP)
     instances = scene_with(group=members(0, 1), instance=instance("group", 1))
     exact = exact_shading.ExactShading
     for owner, name, ask in (
-        (exact, "complete", lambda: interaction(shape).n),
+        (exact, "complete", lambda: hit(shape, *TOP).n),
         (exact, "complete", lambda: mi.render(scene, spp=1, seed=3)),
         (exact, "attribute", lambda: shape.eval_attribute("vertex_heat", si)),
         (exact, "attribute", lambda: shape.eval_attribute_1("vertex_heat", si)),
@@ -145,7 +123,7 @@ def test_errors_pass_through_loops_and_derivatives(monkeypatch):
     # Inside a loop of the answer, too.
     complete_by(monkeypatch, lambda _, si, *__: dr.while_loop((mi.UInt32(si.prim_index),), lambda i: i < 3, fail))
     with raises_answer():
-        interaction(make())
+        hit(make(), *TOP)
 
 
 @every_array_variant
@@ -161,7 +139,7 @@ def test_errors_keep_no_objects_of_c_and_go_with_their_last_name(monkeypatch):
 
     complete_by(monkeypatch, complete)
     with pytest.raises(AnswerError) as caught:
-        interaction(make())
+        hit(make(), *TOP)
     frames = {frame.f_code.co_name: frame for frame, _ in traceback.walk_tb(caught.value.__traceback__)}
     assert frames["complete"].f_locals == frames["_complete"].f_locals == {}
     del caught, frames
@@ -191,7 +169,7 @@ ask()
 exact_shading.ExactShading.complete = fail
 print(len({ask() for _ in range(3)}))
 """
-    assert printed(code) == "[True, False]\n1\n"
+    assert printed(BEGIN + code) == "[True, False]\n1\n"
 
 
 @llvm
@@ -221,7 +199,9 @@ def test_mitsubas_own_errors_are_those_of_vertex_shading():
 # Interruptions
 
 INTERRUPTED = """
-import os, threading, time
+import os, signal, threading, time
+# What runs in the background of a shell ignores interruptions otherwise.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 def chain(error):
     return [] if error is None else [type(error).__name__, *chain(error.__cause__)]
 def interrupt():
@@ -253,7 +233,7 @@ for shading in ("vertex", "exact"):
 # Many renders, which take most of their time in answers.
 @llvm
 def test_an_interruption_is_raised_when_mitsuba_has_returned():
-    turns = printed(INTERRUPTED).splitlines()
+    turns = printed(BEGIN + INTERRUPTED).splitlines()
     assert [turn.split()[0] for turn in turns] == ["vertex"] * 2 + ["exact"] * 2
 
 
@@ -338,14 +318,14 @@ def test_groups_side_by_side_are_as_each_alone():
 @every_array_variant
 def test_shapes_come_and_go():
     # Addresses are used again, so that answers kept for too long would be those of another cage.
-    expected = rows(interaction(make()).sh_frame.n)
+    expected = rows(hit(make(), *TOP).sh_frame.n)
     for turn in range(120):
         shape = make(flip_normals=turn % 2 == 1)
         if turn % 40 < 2:
             sign = -1 if turn % 2 else 1
-            np.testing.assert_allclose(rows(interaction(shape).sh_frame.n), sign * expected, atol=1e-6)
+            np.testing.assert_allclose(rows(hit(shape, *TOP).sh_frame.n), sign * expected, atol=1e-6)
     plain = mi.load_dict({"type": "sphere"})
-    assert rows(interaction(plain).p)[0, 2] == pytest.approx(np.sqrt(1 - 0.13**2 - 0.21**2), abs=1e-5)
+    assert rows(hit(plain, *TOP).p)[0, 2] == pytest.approx(np.sqrt(1 - 0.13**2 - 0.21**2), abs=1e-5)
 
 
 @every_array_variant
@@ -372,7 +352,7 @@ def test_variants_side_by_side():
         shapes[name] = make()
     for name in reversed(shapes):
         mi.set_variant(name)
-        normals[name] = rows(interaction(shapes[name]).sh_frame.n)
+        normals[name] = rows(hit(shapes[name], *TOP).sh_frame.n)
     np.testing.assert_allclose(normals["llvm_ad_spectral"], normals["llvm_ad_rgb"], atol=1e-6)
 
 
@@ -442,7 +422,7 @@ def test_another_version_works_if_nothing_has_moved(monkeypatch):
     monkeypatch.setattr(mi, "__version__", "3.9.2")
     # A class's table keeps what the first hook has put there.
     monkeypatch.setattr(interaction_hook.InteractionHook, "_tag_groups", lambda _: None)
-    assert interaction(make()).is_valid()
+    assert hit(make(), *TOP).is_valid()
 
 
 def hard_of_hearing(trial, si, hit):
@@ -508,7 +488,8 @@ def test_code_longer_than_its_page_is_refused():
 @llvm
 def test_the_first_shape_of_a_variant_needs_it_to_be_set():
     """Mitsuba makes the group that is built upon in the variant that is set: it was of another class."""
-    code = """
+    text = printed("""
+import mitsuba as mi, mitsuba_subdivision as msub
 msub.register_variant("llvm_ad_rgb")
 config = mi.parser.ParserConfig("llvm_ad_rgb")
 cage = {"type": "subdivision", "filename": msub.example_file("cages/rook.obj"), "shading": "exact"}
@@ -521,8 +502,6 @@ for current in (None, "scalar_rgb"):
         mi.parser.instantiate(config, state)
     except RuntimeError as error:
         print(error)
-"""
-    done = program(code)
-    assert done.returncode == 0, done.stderr
+""")
     for current in ("no variant", "scalar_rgb"):
-        assert f'made while {current} was set; expected mi.set_variant("llvm_ad_rgb") before' in done.stdout
+        assert f'made while {current} was set; expected mi.set_variant("llvm_ad_rgb") before' in text

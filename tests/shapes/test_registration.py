@@ -1,7 +1,5 @@
 """The plugin is there in every variant, in any order of import and `set_variant`; exact shading, where it works."""
 
-import subprocess
-import sys
 import threading
 from pathlib import Path
 
@@ -16,9 +14,10 @@ from mitsuba_subdivision.shapes.interaction_hook import exact_shading_problem, h
 from shapes.cages import cube, described, load
 from shapes.scenes import down, scene_with, vertices
 from shapes.updates import update
-from shapes.variants import every_variant, exact_llvm, llvm, scalar
+from shapes.variants import every_variant, exact_llvm, llvm, printed, scalar
 
 STAR = Path(__file__).parents[2] / "scenes/cages/star.obj"
+# In a process of its own: other tests use the variant where Mitsuba looks types up.
 BEGIN = """
 def cube():
     from mitsuba_subdivision.cage import named_cages
@@ -34,13 +33,6 @@ ORDERS = {
 needs_llvm = pytest.mark.skipif(llvm_problem() is not None, reason="no usable LLVM")
 
 
-def run(code):
-    """In a process of its own: other tests use the variant where Mitsuba looks types up."""
-    command = [sys.executable, "-W", "error", "-c", BEGIN + code]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
-
-
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_shape_is_there_in_any_order_of_imports_and_variants(order):
     llvm = [] if llvm_problem() else ["llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral"]
@@ -48,7 +40,7 @@ def test_the_shape_is_there_in_any_order_of_imports_and_variants(order):
     # Back and forth.
     for variant in (*llvm, "scalar_spectral", "scalar_rgb") if order == "import between" else ():
         again += f"mi.set_variant('{variant}'); assert faces() == [768], '{variant}'\n"
-    run(f"{ORDERS[order]}\nassert faces() == [768], faces()\n{again}")
+    printed(f"{BEGIN}{ORDERS[order]}\nassert faces() == [768], faces()\n{again}")
 
 
 def test_every_variant(variants_all):
@@ -120,7 +112,7 @@ def test_equal_shapes_of_a_scene_stay_two_and_can_be_written_as_xml():
 
 def test_a_first_picture_imports_little():
     # What Mitsuba itself has imported costs nothing more. These take longest of the rest.
-    run(f"""
+    printed(f"""
 import sys, mitsuba as mi, numpy
 there = set(sys.modules)
 import mitsuba_subdivision

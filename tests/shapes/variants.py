@@ -1,4 +1,7 @@
-"""In which variants a test runs, and with which shading."""
+"""In which variants a test runs, with which shading, or in a process of its own."""
+
+import subprocess
+import sys
 
 import pytest
 from mitsuba_subdivision.shapes.interaction_hook import hook_problem
@@ -15,3 +18,11 @@ mirrors = pytest.mark.parametrize("mirror", [1, -1])
 
 def exact_llvm(test):
     return exact(llvm(test))
+
+
+def printed(code):
+    """What a program prints, in a process of its own, which may crash; a warning is an error."""
+    command = [sys.executable, "-W", "error", "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
