@@ -9,7 +9,6 @@ from mitsuba_subdivision.kernels.locations import Location, TriangleLocations
 pytestmark = [pytest.mark.core, pytest.mark.usefixtures("llvm")]
 
 SURFACES = ["hexagon", "valence 2", "crease", "holes", "non-manifold", "loop corner", "doo_sabin mixed torus"]
-EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
 TRIANGULATED = ["torus", "hexagon", "valence 2", "mixed torus", "half disc of 6", "boundary none", "holes", *HOLES]
 TRIANGULATED += ["loop corner", "loop mixed torus", "doo_sabin mixed torus", "doo_sabin sheet"]
 # Of parameters, after some sums and products.
@@ -63,10 +62,11 @@ def every_side(surface, rng):
         yield side, every, along, has_neighbour
 
 
-@EVERY_SURFACE
-def test_both_sides_of_an_edge_are_the_same_points(name, np_rng):
+@pytest.mark.parametrize("name", SURFACES)
+def test_both_sides_of_an_edge_are_the_same_points_and_lead_back_or_to_the_border(name, np_rng):
+    """Beyond an edge by as much as inside of it: reflected there, it leads back to the reflected place here."""
     surface, kernel = kernel_of(name)
-    domain, seen = surface.scheme.domain, 0
+    domain, elements, seen = surface.scheme.domain, surface.patches.elements, 0
     for side, half_edge, along, has_neighbour in every_side(surface, np_rng):
         on_edge = beside(domain, side, along, 0)
         # So little beyond that the point is the same but for rounding.
@@ -79,15 +79,7 @@ def test_both_sides_of_an_edge_are_the_same_points(name, np_rng):
         np.testing.assert_allclose(here, there, rtol=0, atol=POINT)
         assert not left[~has_neighbour].any()
         seen += np.count_nonzero(left)
-    assert seen > 0
 
-
-@EVERY_SURFACE
-def test_carried_there_and_back_is_where_it_was_or_at_the_border(name, np_rng):
-    """Beyond an edge by as much as inside of it: reflected there, it leads back to the reflected place here."""
-    surface, kernel = kernel_of(name)
-    domain, elements = surface.scheme.domain, surface.patches.elements
-    for side, half_edge, along, has_neighbour in every_side(surface, np_rng):
         inside, outside = (beside(domain, side, along, depth) for depth in (BEYOND, -BEYOND))
         stayed, unchanged = carried(kernel, locations(kernel.types, half_edge, inside))
         np.testing.assert_array_equal(stayed, half_edge)
@@ -109,6 +101,7 @@ def test_carried_there_and_back_is_where_it_was_or_at_the_border(name, np_rng):
         kept = has_neighbour & (elements.face[reached] != elements.face[half_edge])
         np.testing.assert_array_equal(here[0][kept], expected[0][kept])
         np.testing.assert_allclose(here[1][kept], expected[1][kept], rtol=0, atol=10 * ROUNDING)
+    assert seen > 0
 
 
 def as_seen_from_first(surface, half_edge, uv):
@@ -123,17 +116,16 @@ def as_seen_from_first(surface, half_edge, uv):
 # Triangles
 
 
-def made(name, rate):
-    surface = surface_named(name)
-    kernel, table = kernel_named(name, "llvm_ad_rgb_double"), surface.sampling(rate)
-    return surface, kernel, table, TriangleLocations(table, kernel.walk)
+def triangles_of(name, rate):
+    table = surface_named(name).sampling(rate)
+    return kernel_of(name), table, TriangleLocations(table, kernel_of(name)[1].walk)
 
 
 @pytest.mark.parametrize("name", TRIANGULATED)
 # Even and odd: at odd rates, triangles reach from one corner of a polygon into the next.
 @pytest.mark.parametrize("rate", [1, 3, 4])
 def test_corners_of_triangles_are_vertices(name, rate):
-    surface, kernel, table, locations = made(name, rate)
+    (surface, kernel), table, locations = triangles_of(name, rate)
     types, expected = kernel.types, table.apply(surface.cage.positions)[0]
     count = len(table.triangles)
     triangle = np.repeat(np.arange(count), 3)
@@ -149,7 +141,7 @@ def test_corners_of_triangles_are_vertices(name, rate):
 @pytest.mark.parametrize("rate", [2, 5])
 def test_triangles_that_share_an_edge_have_its_points_in_common(name, rate, np_rng):
     """Within an element and across: those on either side of a crease have vertices of their own."""
-    surface, kernel, table, locations = made(name, rate)
+    (surface, kernel), table, locations = triangles_of(name, rate)
     types, triangles = kernel.types, table.triangles.astype(np.int64)
     edges = {}
     for triangle, corners in enumerate(triangles.tolist()):

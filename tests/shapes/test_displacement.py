@@ -14,7 +14,7 @@ from reference.refined_cages import tagged
 from scipy import ndimage
 from shapes.cages import RING, bitmap, cube, load
 from shapes.scenes import buffer, camera_rays, scene_with, vertices, waves
-from shapes.updates import differentiated, update
+from shapes.updates import differentiated, moving, update
 from shapes.variants import every_ad_variant, every_variant, exact, exact_llvm
 
 # Places and normals in single precision, of a cage of size one; normals take differences of differences.
@@ -447,25 +447,24 @@ def test_textures_that_are_no_heights_are_refused():
 
 
 @every_ad_variant
-def test_normals_turn_when_texture_coordinates_slide_over_a_bitmap():
+def test_normals_turn_when_texture_coordinates_slide_over_a_bitmap(np_rng):
     """They did not, but for the products of both coordinates: slopes of bitmaps are constant along a texel."""
     x, y, z = cube().positions.T
     cage = cube(texcoords=np.stack([0.3 * x + 0.11 * z + 0.5, 0.3 * y + 0.23 * z + 0.5], axis=1))
     t, s = np.meshgrid(*[(np.arange(256) + 0.5) / 256] * 2, indexing="ij")
     image = bitmap((np.sin(4 * np.pi * s) * np.cos(2 * np.pi * t))[:, :, None].astype(np.float32))
     parameters = mi.traverse(load(cage, displacement=image, displacement_scale=0.02))
-    given = mi.Float(parameters["cage_texcoords"])
-    way = upload(mi.Float, np.random.default_rng(1).normal(size=dr.width(given)))
+    assign, step = moving(parameters, "cage_texcoords", np_rng), dr.opaque(mi.Float, 0)
 
     def normals(step):
+        assign(step)
         # Dr.Jit clears the derivatives of what others are computed from.
-        return 1 * update(parameters, cage_texcoords=given + step * way)["vertex_normals"]
+        return 1 * parameters["vertex_normals"]
 
-    step = mi.Float(0)
     dr.enable_grad(step)
-    moving = normals(step)
+    sliding = normals(step)
     dr.set_grad(step, 1)
-    derivative = np.array(dr.forward_to(moving))
+    derivative = np.array(dr.forward_to(sliding))
     # Over some texels, as slopes jump from one to the next.
     expected = (np.array(normals(SLIDE)) - np.array(normals(-SLIDE))) / (2 * SLIDE)
     assert np.abs(derivative - expected).mean() < 0.2 * np.abs(expected).mean()

@@ -9,7 +9,7 @@ from mitsuba_subdivision.device_arrays import upload
 from shapes.cages import cube, described
 from shapes.scenes import perspective, scene_with
 from shapes.updates import update
-from shapes.variants import exact, shadings
+from shapes.variants import exact
 
 # A scene that is freed while a function is being frozen, or before it runs again, is one that Dr.Jit misses.
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb", "no_other_scene")
@@ -78,48 +78,39 @@ def test_updates_inside_of_a_frozen_function_are_recorded(shading, by, given):
         assert frozen.n_recordings == min(number, 2)
 
 
-def loss_of(scene, parameters, seed):
-    return dr.mean(dr.square(mi.render(scene, parameters, spp=2, seed=seed) - 0.5), axis=None)
-
-
-@pytest.mark.parametrize(("shading", "by", "given"), TOGETHER[:2])
-def test_gradients_of_a_frozen_picture_reach_what_was_updated_before(shading, by, given):
+@pytest.mark.parametrize(
+    ("shading", "by", "given", "is_whole"),
+    [
+        ("vertex", (*SURFACE, "displacement_scale", *COLOURS), DISPLACED, False),
+        pytest.param("exact", (*SURFACE, *COLOURS), {}, False, marks=exact),
+        ("vertex", ("cage_colour",), {}, True),
+        pytest.param("exact", ("cage_colour",), {}, True, marks=exact),
+    ],
+)
+def test_gradients_of_frozen_pictures_and_of_whole_steps_are_those_of_others(shading, by, given, is_whole):
     def picture(scene, parameters, seed):
-        loss = loss_of(scene, parameters, seed)
-        dr.backward(loss)
-        return dr.detach(loss)
+        dr.backward(dr.mean(dr.square(mi.render(scene, parameters, spp=2, seed=seed) - 0.5), axis=None))
 
-    def gradients(picture, scene, parameters, number):
-        new = values(by, number)
+    def step(picture, scene, parameters, new, seed):
         leaves = [getattr(value, "matrix", value) for value in new.values()]
         dr.enable_grad(leaves)
         update(parameters, new)
-        picture(scene, parameters, dr.opaque(mi.UInt32, number))
-        return [np.array(dr.grad(leaf)) for leaf in leaves]
+        picture(scene, parameters, seed)
+        return [dr.grad(leaf) for leaf in leaves]
 
-    plain, frozen, function = loaded(shading, **given), loaded(shading, **given), dr.freeze(picture)
-    for number in range(1, 4):
-        pairs = zip(gradients(picture, *plain, number), gradients(function, *frozen, number), strict=True)
-        for name, (expected, gradient) in zip(by, pairs, strict=True):
-            assert abs(expected).max() > 0
-            np.testing.assert_allclose(gradient, expected, atol=ORDER_OF_SUMS * abs(expected).max(), err_msg=name)
-    assert function.n_recordings == 2
-
-
-@shadings
-def test_steps_of_colours_are_frozen_whole(shading):
-    def step(scene, parameters, colours, seed):
-        dr.enable_grad(colours)
-        update(parameters, colours)
-        dr.backward(loss_of(scene, parameters, seed))
-        return dr.grad(colours["shape.cage_colour"])
-
-    plain, frozen, function = loaded(shading), loaded(shading), dr.freeze(step)
+    plain, frozen, function = (
+        loaded(shading, **given),
+        loaded(shading, **given),
+        dr.freeze(step if is_whole else picture),
+    )
     for number in range(1, 4):
         seed = dr.opaque(mi.UInt32, number)
-        expected = np.array(step(*plain, values(["cage_colour"], number), seed))
-        frozen_gradient = np.array(function(*frozen, values(["cage_colour"], number), seed))
-        np.testing.assert_allclose(frozen_gradient, expected, atol=ORDER_OF_SUMS * abs(expected).max())
+        expected, arguments = step(picture, *plain, values(by, number), seed), (*frozen, values(by, number), seed)
+        gradients = function(picture, *arguments) if is_whole else step(function, *arguments)
+        for name, gradient, other in zip(by, gradients, expected, strict=True):
+            largest = np.abs(np.array(other)).max()
+            assert largest > 0
+            np.testing.assert_allclose(np.array(gradient), np.array(other), atol=ORDER_OF_SUMS * largest, err_msg=name)
     assert function.n_recordings == 2
 
 

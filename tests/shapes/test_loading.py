@@ -187,28 +187,18 @@ def test_shapes_of_equal_topology_share_all_but_positions(shading, tmp_path, np_
     assert files[0]._mesh.table is from_arrays[0]._mesh.table
 
 
+OTHER_TAGS = [{"creases": [(0, 1, 3.0)]}, {"creases": [(0, 1, 10.0)]}, {"corners": [(0, 2.0)]}, {"holes": [2]}]
+OTHER_TAGS += [{"boundary": "edge_only"}, {"triangle_rule": "smooth"}, {"crease_method": "chaikin"}]
+OTHER_TAGS += [{"face_varying": "all"}]
+
+
 @scalar
-@pytest.mark.parametrize(
-    ("tags", "parameters"),
-    [
-        ({"creases": [(0, 1, 3.0)]}, {}),
-        ({"creases": [(0, 1, 10.0)]}, {}),
-        ({"corners": [(0, 2.0)]}, {}),
-        ({"holes": [2]}, {}),
-        ({"boundary": "edge_only"}, {}),
-        ({"triangle_rule": "smooth"}, {}),
-        ({"crease_method": "chaikin"}, {}),
-        ({"face_varying": "all"}, {}),
-        ({}, {"scheme": "doo_sabin"}),
-        ({}, {"tessellation_rate": 3}),
-    ],
-    ids=str,
-)
-def test_shapes_of_other_tags_rules_or_schemes_share_no_patches_and_those_of_another_rate_only_these(tags, parameters):
-    one, two = load(cube()), load(cube(**tags), **parameters)
-    assert one._mesh.table is not two._mesh.table
-    share = one._parameters.surface.patches is two._parameters.surface.patches
-    assert share == ("tessellation_rate" in parameters)
+@pytest.mark.parametrize("tags", OTHER_TAGS, ids=str)
+def test_shapes_of_other_tags_rules_or_schemes_share_no_patches_and_those_of_another_rate_only_these(tags):
+    one, of_rate = load(cube()), load(cube(), tessellation_rate=3)
+    for two in (load(cube(**tags)), load(cube(), scheme="doo_sabin"), of_rate):
+        assert one._mesh.table is not two._mesh.table
+        assert (one._parameters.surface.patches is two._parameters.surface.patches) == (two is of_rate)
 
 
 @every_variant
