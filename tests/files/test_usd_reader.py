@@ -10,7 +10,7 @@ from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage
 from mitsuba_subdivision.cage.contents import RULES
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.files.usd_writer import write_usd
-from usd.stages import moved, prim
+from usd.stages import moved, prim, stated
 
 pxr = pytest.importorskip("pxr")
 
@@ -190,8 +190,7 @@ def test_points_are_in_world_space(read):
 
 POINTS_LINE = next(line for line in SHEET.splitlines() if "points" in line)
 HEIGHTS = [[(0, 0, z), (1, 0, z), (2, 0, z), (0, 1, z), (1, 1, z), (2, 0, z)] for z in (1, 2)]
-MOVING = f"point3f[] points.timeSamples = {{ 1: {HEIGHTS[0]}, 3: {HEIGHTS[1]} }}"
-ORDER = 'uniform token[] xformOpOrder = ["xformOp:translate"]'
+MOVING = stated("point3f[] points", {1: HEIGHTS[0], 3: HEIGHTS[1]})
 
 
 @pytest.mark.parametrize(
@@ -199,7 +198,7 @@ ORDER = 'uniform token[] xformOpOrder = ["xformOp:translate"]'
     [(None, 1, 4), (0, 1, 4), (1, 1, 4), (2, 1.5, 4), (2.5, 1.75, 5), (3, 2, 6), (4, 2, 8), (100, 2, 8)],
 )
 def test_points_and_transforms_at_a_time(read, time, height, shift):
-    move = f"double3 xformOp:translate.timeSamples = {{ 2: (4, 0, 0), 4: (8, 0, 0) }}\n{ORDER}"
+    move = moved(translate={2: (4, 0, 0), 4: (8, 0, 0)})
     cage = read(old=POINTS_LINE, new=MOVING, transform=move, time=time)
     np.testing.assert_array_equal(cage.positions, np.add(HEIGHTS[0], [shift, 0, height - 1]))
 
@@ -226,10 +225,10 @@ SAMPLED_POINTS = [
 def test_meshes_are_read_at_the_first_time_with_points_and_faces(read, points):
     primvar = 'float[] primvars:w (interpolation = "vertex")\nfloat[] primvars:w.timeSamples = '
     primvar += "{ 1: [], 2: [0, 1, 2, 3, 4, 5], 3: [9] }"
-    move = "double3 xformOp:translate.timeSamples = { 0: (9, 9, 9), 2: (4, 0, 0), 9: (1, 1, 1) }\n"
+    move = moved(translate={0: (9, 9, 9), 2: (4, 0, 0), 9: (1, 1, 1)})
     points = points.format(POINTS_LINE.partition("= ")[2], [(0, 0, 0)] * 6, "[4, 4]")
     old = POINTS_LINE if "Counts" not in points else f"{POINTS_LINE}\n        int[] faceVertexCounts = [4, 4]"
-    cage = read(old=old, new=points, mesh=primvar, transform=move + ORDER)
+    cage = read(old=old, new=points, mesh=primvar, transform=move)
     np.testing.assert_array_equal(cage.positions, np.add(np.array(POINTS, dtype=np.float32), [4, 0, 0]))
     np.testing.assert_array_equal(cage.attributes["w"].values[:, 0], np.arange(6))
 

@@ -34,10 +34,15 @@ def prim(kind, name, *body, apis=(), head=""):
     return "\n".join([f'def {kind} "{name}" (\n{head}\n) {{', *body, "}\n"])
 
 
+def stated(name, value):
+    """A statement of an attribute, whose value may be samples by their times."""
+    return f"{name}{'.timeSamples' if isinstance(value, dict) else ''} = {value}\n"
+
+
 def moved(**steps):
     """Operations of a transform in the order in which they are given."""
     types = {"translate": "double3", "scale": "float3", "rotateXYZ": "float3"}
-    lines = [f"{types.get(name, 'float')} xformOp:{name} = {value}\n" for name, value in steps.items()]
+    lines = [stated(f"{types.get(name, 'float')} xformOp:{name}", value) for name, value in steps.items()]
     order = ", ".join(f'"xformOp:{name}"' for name in steps)
     return "".join([*lines, f"uniform token[] xformOpOrder = [{order}]\n"])
 

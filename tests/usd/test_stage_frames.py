@@ -30,16 +30,10 @@ RAISED = "(-1,-1,-1), (1,-1,-1), (-1,1,-1), (1,1,-1), (-.3,-.3,3), (.3,-.3,3), (
 COLORS = "(1,0,0), (0,1,0), (0,0,1), (1,1,0), (1,0,1), (0,1,1), (1,1,1), (0,0,0)"
 
 
-def placed(at, end=None):
-    """A translation, which may move from time 1 to time 5."""
-    value = f" = {at}" if end is None else f".timeSamples = {{1: {at}, 5: {end}}}"
-    return f'double3 xformOp:translate{value}\nuniform token[] xformOpOrder = ["xformOp:translate"]\n'
-
-
 MOVING = prim("Mesh", "moving", f"point3f[] points.timeSamples = {{1: [{CORNERS}], 5: [{RAISED}]}}", FACES)
-STILL = prim("Mesh", "still", CUBE, placed((2.6, 0.4, 0)), "color3f[] primvars:displayColor = [(.1,.2,.7)]")
+STILL = prim("Mesh", "still", CUBE, moved(translate=(2.6, 0.4, 0)), "color3f[] primvars:displayColor = [(.1,.2,.7)]")
 TINTS = f'color3f[] primvars:displayColor = [{COLORS}] (interpolation = "vertex")'
-TINTED = prim("Mesh", "tinted", CUBE, placed((-2.6, 0, 0), (-2.6, 0, 2)), TINTS)
+TINTED = prim("Mesh", "tinted", CUBE, moved(translate={1: (-2.6, 0, 0), 5: (-2.6, 0, 2)}), TINTS)
 # Polygons with a texture.
 LARGE = SQUARE.replace("(-1,-1,0), (1,-1,0), (1,1,0), (-1,1,0)", "(-6,-6,-1.4), (6,-6,-1.4), (6,6,-1.4), (-6,6,-1.4)")
 FLOOR = mesh("floor", LARGE, bound()) + material(
@@ -48,29 +42,16 @@ FLOOR = mesh("floor", LARGE, bound()) + material(
     texture("tiles.png"),
 )
 INSTANCES = f'class Xform "ball" {{\n{prim("Mesh", "ball", CUBE)}}}\n' + "".join(
-    prim(
-        "Xform",
-        f"ball{n}",
-        f"double3 xformOp:translate.timeSamples = {{1: ({x}, 3, 0), 5: ({x}, 3, 2)}}",
-        "float3 xformOp:scale = (.4, .4, .4)",
-        'uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:scale"]',
-        head="instanceable = true\nreferences = </ball>",
-    )
+    prim("Xform", f"ball{n}", move, head="instanceable = true\nreferences = </ball>")
     for n, x in enumerate((-2, 2))
+    for move in [moved(translate={1: (x, 3, 0), 5: (x, 3, 2)}, scale=(0.4,) * 3)]
 )
-LAMP_MOVES = placed((-4, -3, 5), (4, -3, 5))
+LAMP_MOVES = moved(translate={1: (-4, -3, 5), 5: (4, -3, 5)})
 LAMP = prim("SphereLight", "lamp", "float inputs:radius = 0.5", "float inputs:intensity = 60", LAMP_MOVES)
 SKY = prim("DomeLight", "sky", "float inputs:intensity = 0.5", "asset inputs:texture:file = @sky.exr@")
-CAMERA = """def Camera "camera" {
-    float focalLength = 35
-    float horizontalAperture = 24
-    float verticalAperture = 18
-    double3 xformOp:translate.timeSamples = {1: (0, -14, 5), 5: (9, -11, 5)}
-    float xformOp:rotateX = 72
-    float xformOp:rotateZ.timeSamples = {1: 0, 5: 39}
-    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateZ", "xformOp:rotateX"]
-}
-"""
+LENS = "float focalLength = 35\nfloat horizontalAperture = 24\nfloat verticalAperture = 18"
+ORBIT = moved(translate={1: (0, -14, 5), 5: (9, -11, 5)}, rotateZ={1: 0, 5: 39}, rotateX=72)
+CAMERA = prim("Camera", "camera", LENS, ORBIT)
 BARE = MOVING + STILL + TINTED + INSTANCES
 WHOLE = BARE + FLOOR + LAMP + SKY + CAMERA
 
@@ -92,7 +73,7 @@ FLYING = prim(
     "rel prototypes = </still>\nint[] protoIndices.timeSamples = {1: [0]}",
     "point3f[] positions.timeSamples = {1: [(0, 0, 5)]}\nvector3f[] velocities.timeSamples = {1: [(1, 0, 0)]}",
 )
-RIG = placed((0, 0, 0), (1, 0, 0))
+RIG = moved(translate={1: (0, 0, 0), 5: (1, 0, 0)})
 
 
 def frame_range(path, numbers):
@@ -188,7 +169,7 @@ def test_where_only_the_camera_moves_all_else_is_read_and_loaded_once(tmp_path, 
     focus = "float fStop = 5.6\nfloat focusDistance.timeSamples = {1: 9, 5: 14}"
     lens = f"float focalLength.timeSamples = {{1: 35, 5: 50}}\n{focus}"
     rig = prim("Xform", "rig", RIG, CAMERA.replace("float focalLength = 35", lens))
-    path = write(tmp_path, STILL + FLOOR + LAMP.replace(LAMP_MOVES, placed((4, -3, 5))) + rig)
+    path = write(tmp_path, STILL + FLOOR + LAMP.replace(LAMP_MOVES, moved(translate=(4, -3, 5))) + rig)
     pictures = frames(path, (1, 3, 5))
     assert [len(calls) for calls in made] == [1, 1]
     assert_each_is_as_alone(path, (1, 3, 5), pictures)
@@ -257,13 +238,7 @@ def test_the_command_shows_and_saves_whole_stages(tmp_path, monkeypatch, capsys)
 
 TEXTURE_SIDE = 64
 # The camera moves from afar to near; the nearest frame is neither the first nor the last.
-APPROACH = prim(
-    "Camera",
-    "camera",
-    "float horizontalAperture = 24\nfloat verticalAperture = 18\nfloat focalLength = 35",
-    "double3 xformOp:translate.timeSamples = {1: (0, 0, 90), 2: (0, 0, 40), 3: (0, 0, 70)}",
-    'uniform token[] xformOpOrder = ["xformOp:translate"]',
-)
+APPROACH = prim("Camera", "camera", LENS, moved(translate={1: (0, 0, 90), 2: (0, 0, 40), 3: (0, 0, 70)}))
 # Here it comes near while the shutter is open.
 OPENED = APPROACH.replace("float focal", "double shutter:open = 0\ndouble shutter:close = 1\nfloat focal")
 OPENED = OPENED.replace("2: (0, 0, 40)", "2: (0, 0, 10)")
@@ -328,7 +303,7 @@ def test_warnings_of_all_frames_are_told_once(tmp_path):
 def crossing(folder, opens, closes):
     """A bright square, a quarter of the picture wide, that moves by half a picture from time 0 to 1."""
     square = SQUARE.replace("(-1,", "(-.5,").replace("(1,", "(.5,"), "color3f inputs:color = (1, 1, 1)"
-    move = moved(translate="").replace(" = \n", ".timeSamples = {0: (-1.5, 0, 0), 1: (0.5, 0, 0)}\n", 1)
+    move = moved(translate={0: (-1.5, 0, 0), 1: (0.5, 0, 0)})
     aperture = "float horizontalAperture = 40\nfloat verticalAperture = 20"
     shutter = f"double shutter:open = {opens}\ndouble shutter:close = {closes}"
     view = 'token projection = "orthographic"', aperture, shutter, moved(translate=(0, 0, 5))

@@ -85,7 +85,7 @@ def instancer(places, prototype, *more):
 
 def test_transforms_are_composed(stage):
     """The points of a limit surface and of polygons are those of the cage in the world."""
-    steps = moved(translateX="", scale=(2, -1, 0.5)).replace("X = ", "X.timeSamples = { 1: 0, 3: 4 }")
+    steps = moved(translateX={1: 0, 3: 4}, scale=(2, -1, 0.5))
     inner = prim("Xform", "b", steps, mesh("smooth", CUBE), mesh("flat", CUBE, POLYGONS))
     path = stage(prim("Xform", "a", moved(translate=(1, 2, 3), rotateZ=30), inner))
     entries = msub.usd_scene(path, mi, time=2, tessellation_rate=8)
@@ -272,7 +272,7 @@ def test_every_value_of_a_prim_is_its_default_or_else_its_first_sample(stage):
 
 def test_a_layer_without_a_rate_of_times_is_read(stage, tmp_path):
     """USD looks for the times of its samples for ever."""
-    move = moved(translate="").replace(" = \n", ".timeSamples = { 1: (0, 0, 3), 2: (0, 0, 4) }\n", 1)
+    move = moved(translate={1: (0, 0, 3), 2: (0, 0, 4)})
     (tmp_path / "layer.usda").write_text(f"#usda 1.0\n( timeCodesPerSecond = 24 )\n{mesh('cube', CUBE, move)}")
     (shape,) = StageReader(stage("", head="subLayers = [@layer.usda@]\n    timeCodesPerSecond = 0")).at().shapes
     np.testing.assert_array_equal(shape.to_world[:3, 3], [0, 0, 3])
