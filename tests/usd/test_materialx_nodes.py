@@ -59,14 +59,10 @@ CASES = [
 
 
 @pytest.mark.core
-@pytest.mark.parametrize(("category", "kind", "inputs", "expected"), CASES)
-def test_what_is_constant_is_computed(category, kind, inputs, expected):
-    np.testing.assert_allclose(node(category, kind, **inputs), expected, atol=1e-7)
-
-
-@pytest.mark.parametrize(("category", "kind", "inputs", "_expected"), CASES)
-def test_a_node_of_a_picture_has_its_values_whether_or_not_it_stays_a_picture(category, kind, inputs, _expected):
+@pytest.mark.parametrize(("category", "kind", "inputs", "result"), CASES)
+def test_nodes_are_computed_also_of_pictures_and_whether_or_not_they_stay_pictures(category, kind, inputs, result):
     """In place of each input, of colours from -3 to 3 and of one that stands for a file that is not there."""
+    np.testing.assert_allclose(node(category, kind, **inputs), result, atol=1e-7)
     random = np.random.default_rng(5)
     colors = random.uniform(-3, 3, (20, 4))
     for name, given in inputs.items():
