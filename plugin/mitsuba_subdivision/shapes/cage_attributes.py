@@ -10,7 +10,7 @@ change and be differentiated.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Container, Iterable
 from typing import TYPE_CHECKING, Any
 from weakref import WeakMethod
 
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from ..patches.channel import Channel, ChannelLayout
     from ..surface import LimitSurface
     from ..tessellation.attribute_table import AttributeTable
+    from .displacement import ShapeDisplacement
+    from .exact_shading import ExactShading
 
 PREFIX = "cage_"
 # Names of attributes whose buffers would be those of every Mitsuba mesh.
@@ -62,8 +64,9 @@ class CageAttributes:
         variant: Variant,
         surface: LimitSurface,
         names: Iterable[str],  # Names of the attributes that `traverse` exposes
-        followers: Mapping[str, Callable[[FloatBuffer], None]],  # Functions that take new values of attributes, flat
-        displaces: str | None,  # Name of the attribute whose values displace vertices
+        # The parts of the shape that take new values of attributes
+        exact: ExactShading | None,
+        displacement: ShapeDisplacement | None,
         # Method that is called with an attribute's name and the gradient by its values, by the same name, after reverse
         # mode has reached these
         on_backward: WeakMethod,
@@ -80,11 +83,15 @@ class CageAttributes:
         self.values: dict[str, FloatBuffer] = {
             f"{PREFIX}{name}": self._kind(given.array) for name, given in self._given.items()
         }
-        # Names of the parameters that move vertices
-        self.moving = set() if displaces is None else {f"{PREFIX}{displaces}"}
+        # Functions that take new values of attributes, flat, and names of the parameters that move vertices
+        channels = {} if exact is None else exact.channels
+        self._followers = {name: channel.values.set for name, channel in channels.items()}
+        self.moving: set[str] = set()
+        if displacement is not None:
+            self._followers[displacement.attribute] = displacement.set_values
+            self.moving = {f"{PREFIX}{displacement.attribute}"}
         sizes = {name: channel.values.shape[1] for name, channel in self._channels.items()}
         self._upsampling = spectral_upsampling(variant, sizes)
-        self._followers = followers
         # Updated values of attributes, as watched for reverse-mode passes.
         self._moved: dict[str, FloatBuffer] = {}
         self._computed: dict[str, set[int]] = {}

@@ -1,9 +1,8 @@
 """Overrides in Python of the virtual functions that Mitsuba 3.9 calls on a mesh at every hit.
 
-In Mitsuba 3.9, a mesh computes its surface interaction in a virtual C++ function that Python cannot override: Python
-classes may only override ``to_string`` (``src/render/python/shape_v.cpp``, ``PyMesh``). Other hooks of Python run too
-late. A BSDF receives the interaction after the origin of the next ray is set, so facets would cast shadows on a smooth
-surface. Emitters, media and the ``aov`` integrator do not call the BSDF at all.
+In Mitsuba 3.9, a mesh computes its surface interaction in a virtual C++ function that Python cannot override
+(``src/render/python/shape_v.cpp``, ``PyMesh``). Other hooks of Python run too late: a BSDF receives the interaction
+after the origin of the next ray is set, and emitters, media and the ``aov`` integrator do not call it at all.
 
 So a hooked shape gets another virtual function table: a copy of the table of its class, where each function that Python
 overrides calls Python afterwards (`machine_code`). Inside an instance, Mitsuba calls the shapes of all groups. A
@@ -25,7 +24,7 @@ import re
 import sys
 import threading
 from collections.abc import Callable
-from functools import cache, lru_cache
+from functools import cache
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary, WeakValueDictionary
 
@@ -72,7 +71,7 @@ _hooks: dict[Variant, InteractionHook] = {}
 _lock = threading.Lock()
 
 
-@lru_cache(maxsize=1)
+@cache
 def hook_problem() -> str | None:
     """Reason for which shapes cannot be hooked on this system; None if they can."""
     if not (sys.platform == "linux" and platform.machine() == "x86_64" and sys.implementation.name == "cpython"):

@@ -15,7 +15,7 @@ import signal
 import struct
 import traceback
 from collections.abc import Callable
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NoReturn
@@ -34,8 +34,6 @@ _NANOBIND = {
 }
 # The C++ instance of a Python object
 _POINTER_OF = "_ZN8nanobind6detail11nb_inst_ptrEP7_object"
-# Lowest bit of an address that differs between C++ objects, which are aligned to 16 bytes; used by `tag_of`.
-_LOWEST_BIT = 4
 # Upper bound of the size of the exception, in bytes.
 _ERROR_SIZE = 128
 # Format strings of `PyObject_CallFunction`: seven 64-bit numbers, and two objects.
@@ -115,7 +113,7 @@ _FRAME = bytes.fromhex("45 0e10 8602 43 0d06 8303 8c04 00000000")
 # C++ objects and functions
 
 
-@lru_cache(maxsize=1)
+@cache
 def bindings() -> ctypes.PyDLL:
     """Load the library that Mitsuba's bindings share. Raises AttributeError if it lacks a function."""
     library, address = ctypes.PyDLL(str(Path(mi.__file__).parent / "libnanobind-drjit.so")), ctypes.c_void_p
@@ -226,7 +224,8 @@ def calling_before(
 
 def tag_of(address: int) -> int:
     """The tag of a C++ object: bits of its address, in the upper half of 32 bits. Objects rarely share a tag."""
-    return address >> _LOWEST_BIT << 16 & 0xFFFF0000
+    # Objects are aligned to 16 bytes.
+    return address >> 4 << 16 & 0xFFFF0000
 
 
 def require_trampolines() -> None:

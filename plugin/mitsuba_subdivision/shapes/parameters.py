@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import pickle
 import time as clock
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from typing import TYPE_CHECKING, Any
@@ -353,22 +354,13 @@ def cage_of_arrays(name: str | None, **arguments: Any) -> ControlCage:
     Messages contain ``name``. Without a name, it warns for each shape; with a name, the creator of the cage has warned
     before.
     """
+    # A key without references to arrays.
+    digest = blake2b(pickle.dumps(arguments), digest_size=16).digest()
     if name is None:
-        return _shared(_digest(arguments), ControlCage.from_arrays, **arguments)
+        return _shared(digest, ControlCage.from_arrays, **arguments)
     with without_warnings():
         # Equal cages with different names are shared, under the name of the first one.
-        return _shared(("named", _digest(arguments)), ControlCage.from_arrays, **arguments, source=CageSource(name))
-
-
-def _digest(value: Any) -> Hashable:
-    """Cache key of an argument, without references to arrays."""
-    if isinstance(value, Attribute):
-        value = vars(value)
-    if isinstance(value, Mapping):
-        return tuple((name, _digest(item)) for name, item in value.items())
-    if isinstance(value, np.ndarray):
-        return value.shape, str(value.dtype), blake2b(np.ascontiguousarray(value).data, digest_size=16).digest()
-    return value
+        return _shared(("named", digest), ControlCage.from_arrays, **arguments, source=CageSource(name))
 
 
 def _shared(key: Hashable, make: Callable[..., ControlCage], *arguments: Any, **options: Any) -> ControlCage:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 from weakref import WeakMethod
 
@@ -83,22 +82,15 @@ def make_subdivision(
                     self._displacement = ShapeDisplacement(variant, parameters, self._placement.positions, self._exact)
             attributes = mesh_attributes(surface.cage)
             exposed = [name for name in (TEXCOORDS, *attributes) if name in surface.attribute_names]
-            channels = {} if self._exact is None else self._exact.channels
-            followers: dict[str, Callable] = {name: channel.values.set for name, channel in channels.items()}
-            displaces = None if self._displacement is None else self._displacement.attribute
-            if self._displacement is not None:
-                followers[self._displacement.attribute] = self._displacement.set_values
-            on_backward = WeakMethod(self.renew_attribute)
-            self._cage = CageAttributes(variant, surface, exposed, followers, displaces, on_backward)
+            drawn = self._exact, self._displacement
+            self._cage = CageAttributes(variant, surface, exposed, *drawn, WeakMethod(self.renew_attribute))
+            self._mesh = MeshBuffers(variant, parameters, self._placement, *drawn, WeakMethod(self.renew_derivatives))
             self.control_points = mapped(kind, surface.cage.positions)
             if is_jit:
                 # Copied to Dr.Jit's own memory, as frozen functions replace the array.
                 self.control_points = dr.opaque(self.control_points)
             # From a list: with a NumPy array, the compiled kernel would depend on the alignment of its memory.
             self.to_world = variant.AffineTransform4f(parameters.to_world.tolist())
-            drawn = self._exact, self._displacement
-            on_moved = WeakMethod(self.renew_derivatives)
-            self._mesh = MeshBuffers(variant, parameters, self._placement, *drawn, on_moved)
             self._prepare(surface.cage.positions, parameters.to_world)
 
             super().__init__(
