@@ -42,7 +42,7 @@ COLUMN, LEAST_TEXT = 84, 6
 
 @pytest.fixture
 def options(tmp_path):
-    common = {"resolution": RESOLUTION, "spp": SPP, "report": lambda _: None}
+    common = {"resolution": RESOLUTION, "spp": SPP}
     return lambda **other: FigureOptions(tmp_path, **{**common, **other})
 
 
@@ -72,9 +72,9 @@ def test_the_command_line_knows_every_figure_and_the_table_every_function_that_d
     for name in (*FIGURES, "all"):
         assert parser().parse_args(["figure", name]).name == name
     paths = Path(peers.__file__).parent.glob("*.py")
-    pattern = re.compile(r"^def (draw\w*)\(options: FigureOptions\)", re.MULTILINE)
-    functions = {f"{path.stem}.{name}" for path in paths for name in pattern.findall(path.read_text())}
-    assert {figure.function for figure in FIGURES.values()} == functions
+    pattern = re.compile(r"^def draw_(\w+)\(options: FigureOptions\)", re.MULTILINE)
+    functions = {(path.stem, name) for path in paths for name in pattern.findall(path.read_text())}
+    assert {(figure.module, name) for name, figure in FIGURES.items()} == functions
 
 
 def test_figures_of_users_leave_a_checkout_as_it_is():

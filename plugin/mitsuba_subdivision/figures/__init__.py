@@ -1,8 +1,8 @@
 """Figures of the documentation, and the table that lists them.
 
-A new figure is a function and a line. The function gets `FigureOptions`, draws the figure, and returns the files that
-it wrote. The line in the table `FIGURES` names the module and the function, says what the figure shows, and lists the
-options that change it. The command ``figure`` and its help read this table.
+A new figure is a function ``draw_NAME`` and a line. The function gets `FigureOptions`, draws, and returns the files
+that it wrote. The line in the table says what the figure shows, and lists the options that change it. The command
+``figure`` and its help read this table.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ class Figure:
     A call raises FigureError if matplotlib is not installed; the message names the extra that brings it.
     """
 
-    function: str  # ``module.function`` of this package. The module imports Mitsuba, so it is imported only then.
+    name: str
+    module: str  # Of this package, with the function ``draw_NAME``. It imports Mitsuba, so it is imported only then.
     shows: str  # What the figure shows, for the help
     # Those of "spp", "scheme" and "cage" that change the figure; "resolution" and "width" change all
     options: tuple[str, ...] = ()
@@ -40,38 +41,29 @@ class Figure:
             import matplotlib  # noqa: F401 - only to find out whether it is there
         except ImportError as error:
             raise FigureError("figures need matplotlib: pip install 'mitsuba-subdivision[figures]'") from error
-        module, function = self.function.split(".")
-        draw: Callable[[FigureOptions], list[Path]] = getattr(importlib.import_module(f".{module}", __name__), function)
+        module = importlib.import_module(f".{self.module}", __name__)
+        draw: Callable[[FigureOptions], list[Path]] = getattr(module, f"draw_{self.name}")
         return draw(options)
 
 
-FIGURES: dict[str, Figure] = {
-    "subdivision": Figure(
-        "cages.draw_subdivision", "a cage and its refinements, irregular patches grey", ("spp", "cage")
-    ),
-    "refinement": Figure(
-        "characteristic.draw_refinement", "control points of a patch before and after one refinement", (), COLUMN
-    ),
-    "tree": Figure(
-        "characteristic.draw_tree", "a face divided into polynomials, and the matrix that makes them", (), COLUMN
-    ),
-    "domains": Figure(
-        "characteristic.draw_domains", "parameter domains of the regular patches at each level", ("scheme",), COLUMN
-    ),
-    "artifact": Figure("normal_error.draw_artifact", "normals by (11), (12) and (13)", ("spp", "scheme", "cage")),
-    "error": Figure("normal_error.draw_error", "errors of these normals against level", ("cage",)),
-    "schemes": Figure("scenes.draw_schemes", "one cage under the three schemes", ("spp",)),
-    "creases": Figure("cages.draw_creases", "one cage with smooth, semi-sharp and sharp creases", ("spp", "cage")),
-    "shading": Figure("scenes.draw_shading", "brushed metal, shaded by vertices and exactly at every hit", ("spp",)),
-    "displacement": Figure(
-        "scenes.draw_displacement", "a jar before and after it is displaced, and its triangles", ("spp",)
-    ),
-    "zoom": Figure("normal_error.draw_zoom", "an extraordinary vertex, magnified up to a million times", ("spp",)),
-    "zebra": Figure("zebra.draw", "reflection lines, with exact normals and with others", ("spp", "cage")),
-    "curvature": Figure("characteristic.draw_curvature", "curvature around extraordinary vertices", ("cage",)),
-    "fit": Figure("fit.draw", "cages fitted to pictures, and how near they come", ("spp",)),
-    "hero": Figure("scenes.draw_hero", "a human figure and its control cage", ("spp",)),
-}
+_FIGURES = (
+    Figure("subdivision", "cages", "a cage and its refinements, irregular patches grey", ("spp", "cage")),
+    Figure("refinement", "characteristic", "control points of a patch before and after one refinement", (), COLUMN),
+    Figure("tree", "characteristic", "a face divided into polynomials, and the matrix that makes them", (), COLUMN),
+    Figure("domains", "characteristic", "parameter domains of the regular patches at each level", ("scheme",), COLUMN),
+    Figure("artifact", "normal_error", "normals by (11), (12) and (13)", ("spp", "scheme", "cage")),
+    Figure("error", "normal_error", "errors of these normals against level", ("cage",)),
+    Figure("schemes", "scenes", "one cage under the three schemes", ("spp",)),
+    Figure("creases", "cages", "one cage with smooth, semi-sharp and sharp creases", ("spp", "cage")),
+    Figure("shading", "scenes", "brushed metal, shaded by vertices and exactly at every hit", ("spp",)),
+    Figure("displacement", "scenes", "a jar before and after it is displaced, and its triangles", ("spp",)),
+    Figure("zoom", "normal_error", "an extraordinary vertex, magnified up to a million times", ("spp",)),
+    Figure("zebra", "zebra", "reflection lines, with exact normals and with others", ("spp", "cage")),
+    Figure("curvature", "characteristic", "curvature around extraordinary vertices", ("cage",)),
+    Figure("fit", "fit", "cages fitted to pictures, and how near they come", ("spp",)),
+    Figure("hero", "scenes", "a human figure and its control cage", ("spp",)),
+)
+FIGURES = {figure.name: figure for figure in _FIGURES}
 
 
 def require_options(name: str, given: dict[str, object], formats: Iterable[str]) -> None:

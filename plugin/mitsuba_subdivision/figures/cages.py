@@ -67,7 +67,6 @@ def draw_subdivision(options: FigureOptions) -> list[Path]:
         limit = LimitSurface(cage)
         regular = regular_elements(limit)
         share = area_share(limit, regular)
-        options.report(f"level {level}: {cage.face_count} faces, {100 * share:.1f} % of the area regular")
         scene = staged(stage, mesh=_polyhedron(cage, regular))
         t = cage.topology
         ends = cage.positions[t.face_vertices[[t.edge_half_edge, t.next[t.edge_half_edge]]]]
@@ -77,7 +76,6 @@ def draw_subdivision(options: FigureOptions) -> list[Path]:
         width = 0.55 - 0.12 * level
         rendered.append(_draw_cage(axis, options, f"level {level}", scene, lines, points, width))
         axis.set(title=f"level {level}", xlabel=f"{100 * share:.{0 if share in (0, 1) else 1}f} % regular")
-    options.report("limit surface")
     bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(REGULAR)}}
     scene = staged(stage, surface=limit_surface(limit.cage, RATE, bsdf))
     lines = edge_curves(limit, t.edge_half_edge, EDGE_SEGMENTS >> (LEVELS - 1))
@@ -123,8 +121,8 @@ def _polyhedron(cage: ControlCage, regular: NDArray[np.bool_]) -> mi.Mesh:
         np.concatenate([corners, centres]),
         np.stack([half_edges, t.next, t.half_edge_count + t.face], axis=1),
         {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "face_color"}},
-        normals=np.concatenate([normals[t.face], normals]),
-        face_colours=np.where(regular[:, None], REGULAR, IRREGULAR)[t.face],
+        vertex_normals=np.concatenate([normals[t.face], normals]),
+        face_color=np.where(regular[:, None], REGULAR, IRREGULAR)[t.face],
     )
 
 

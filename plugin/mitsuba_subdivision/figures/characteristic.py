@@ -104,7 +104,6 @@ def draw_domains(options: FigureOptions) -> list[Path]:
     flat, round_ = axes.flat
     # Light enough at every level for black labels.
     colours = matplotlib.colormaps["YlGnBu"](np.linspace(0.03, 0.75, LEVELS))
-    options.report(f"{scheme.name}: {LEVELS} levels, contraction {patch.basis.subdominant:.4f} at valence {VALENCE}")
 
     for level in range(LEVELS):
         style = {"facecolor": colours[level], "edgecolor": LINE, "linewidth": max(0.6 * 0.8**level, 0.2)}
@@ -119,7 +118,6 @@ def draw_domains(options: FigureOptions) -> list[Path]:
                 round_.fill(*sector(image(outline(corners)), i, VALENCE).T, **style)
     flat.fill(*sub_domain(scheme.domain, LEVELS - 1, 0).T, facecolor="#d9d9d9", edgecolor=LINE, linewidth=0.2)
     for axis in (flat, round_):
-        axis.set_aspect("equal")
         hide_frame(axis)
         axis.plot(0, 0, "o", color="#c8432b", clip_on=False, zorder=5)
         axis.margins(0.01)
@@ -164,12 +162,10 @@ def draw_refinement(options: FigureOptions) -> list[Path]:
     patch = patch_of_valence(scheme_named("catmull_clark"), VALENCE)
     old, new, old_edges, new_edges = refinement_step(patch, VALENCE)
     image, domain = partial(on_patch, patch.scheme, patch.signature, old), patch.scheme.domain
-    options.report(f"valence {VALENCE}: {len(old)} control points, {len(new)} after one refinement")
     figure, ((before, after),) = panels(options, 1, 2)
     for axis in (before, after):
         axis.add_collection(LineCollection(list(old_edges), colors=CONTROL_EDGE, linewidths=0.6, zorder=1))
         axis.plot(*old.T, "o", color="black", markersize=4, zorder=4)
-        axis.set_aspect("equal")
         hide_frame(axis)
     style = {"edgecolor": "#30363c", "linewidth": 0.7, "zorder": 2}
     label = {"fontsize": 9, "ha": "center", "va": "center", "zorder": 6}
@@ -206,7 +202,6 @@ def draw_tree(options: FigureOptions) -> list[Path]:
             leaves += [(outward @ domain, level + 1, leaf) for domain, leaf in zip(domains, rows, strict=True)]
         rests.append(outward @ ParameterMap(np.eye(2) * 2.0**-PIECE_LEVELS, np.zeros(2)))
     count, size = ring.vertex_count, len(form.bernstein.indices)
-    options.report(f"{count} control points, {len(leaves)} leaves of {size} coefficients")
     flat = _in_the_plane(ring.topology)
     image = partial(on_patch, scheme, signature, flat)
     figure, ((face, matrix),) = panels(options, 1, 2)
@@ -218,7 +213,6 @@ def draw_tree(options: FigureOptions) -> list[Path]:
         corners = image(np.clip(domain(around), 0, 1))
         face.fill(*corners.T, facecolor=colour, edgecolor=LINE, linewidth=0.4, zorder=2)
     face.plot(*image(np.stack([rest.offset for rest in rests])).T, "o", color="#c8432b", markersize=4, zorder=5)
-    face.set_aspect("equal")
     hide_frame(face)
     face.set(
         title="a face and its one-ring,\nleaves of its patch tree",
@@ -332,7 +326,6 @@ def draw_curvature(options: FigureOptions) -> list[Path]:
     for (valence, surface), column in zip(surfaces.items(), axes.T, strict=True):
         grids, rate = curvature_map(surface, valence, max(options.resolution // 4, 8)), growth(valence)
         measured = largest_by_level(surface, valence)
-        options.report(f"valence {valence}: {rate:.4f} per level; largest at level {DEPTHS[-1]} {measured[-1]:.3g}")
         for axis, values in zip(column, grids[2:], strict=False):
             shown = _draw_disc(axis, zip(*grids[:2], values, strict=True), norm)
         plot = column[-1]
@@ -370,6 +363,6 @@ def _draw_disc(axis: Axes, grids: Iterable[tuple[NDArray[np.floating], ...]], no
         edge.set_clip_path(disc)
         # In grey, both ends of the colours are dark: lines of negative curvature are dashed.
         axis.contour(x, y, value, levels=NEGATIVE, colors="black", linewidths=0.4).set_clip_path(disc)
-    axis.set(aspect="equal", xlim=(-1.02 * RADIUS, 1.02 * RADIUS), ylim=(-1.02 * RADIUS, 1.02 * RADIUS))
+    axis.set(xlim=(-1.02 * RADIUS, 1.02 * RADIUS), ylim=(-1.02 * RADIUS, 1.02 * RADIUS))
     hide_frame(axis)
     return shown

@@ -21,6 +21,7 @@ from ..device_arrays import upload
 from ..fit import CageFit, LargeSteps, Schedule, View
 from ..fit.cage_fit import with_sample_count
 from ..fit.point_fit import mesh_samples
+from ..messages import counted, timed
 from ..schemes.domain import FloatArray
 from ..shapes.derivatives import loss_of_views
 from ..surface import LimitSurface
@@ -94,7 +95,7 @@ Box = tuple[ControlCage, NDArray[np.float64]]
 Course = tuple[list[float], dict[int, ControlCage]]
 
 
-def draw(options: FigureOptions) -> list[Path]:
+def draw_fit(options: FigureOptions) -> list[Path]:
     """Fit the cages and the mesh, and draw the results."""
     if "_ad_" not in str(mi.variant()):
         raise FigureError(f"the figure fits surfaces: variant {mi.variant()}; expected one with derivatives")
@@ -102,13 +103,11 @@ def draw(options: FigureOptions) -> list[Path]:
     with threads_set(1):
         shape = _target()
         views = _views_of(make_mesh(shape.positions, shape.triangles, GREY), PIXELS)
-        options.report(f"{STEPS} steps with a cage of one size")
-        courses = {"cage": _fit_cage([], views)}
-        options.report(f"{STEPS} steps with a cage that is refined")
-        courses["refined"] = _fit_cage([round(REFINED * STEPS)], views)
-        options.report(f"{STEPS} steps with a dense mesh")
-        courses["mesh"] = _fit_mesh(views)
-        options.report(f"{CREASE_STEPS} steps with creases")
+        courses = {
+            "cage": _fit_cage([], views),
+            "refined": _fit_cage([round(REFINED * STEPS)], views),
+            "mesh": _fit_mesh(views),
+        }
         boxes, sharpness = _fit_creases()
 
     # Twelve panels: pictures of the ball and of the box, in rows that plots of their fits complete.
@@ -190,7 +189,7 @@ def _fit_cage(refine: list[int], views: list[View]) -> Course:
         spp=SPP,
     )
     losses, cages = [], {0: fit.cage}
-    for step in range(1, STEPS + 1):
+    for step in counted(range(1, STEPS + 1), "Steps of a cage"):
         losses.append(fit.step())
         if _is_measured(step):
             cages[step] = fit.cage
@@ -215,7 +214,7 @@ def _fit_mesh(views: list[View]) -> Course:
 
     rate = Schedule.of([(0, MESH_RATES[0]), (STEPS, MESH_RATES[1])], "learning_rate")
     losses, meshes = [], {0: mesh}
-    for step in range(STEPS):
+    for step in counted(range(STEPS), "Steps of a dense mesh"):
         params[key] = large_steps.from_differential(optimizer["u"])
         params.update()
         loss = loss_of_views(scene, params, squared_error, sensors, seed=step, spp=0)
@@ -231,6 +230,7 @@ def _fit_mesh(views: list[View]) -> Course:
     return losses, meshes
 
 
+@timed("Fitting creases")
 def _fit_creases() -> tuple[list[Box], NDArray[np.float64]]:
     """Fit a box from a cube whose edges all have the same sharpness.
 

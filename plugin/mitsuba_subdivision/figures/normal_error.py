@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from decimal import Decimal, localcontext
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,9 +20,7 @@ from .. import example_file
 from ..cage import ControlCage
 from ..cage.named_cages import extraordinary
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
-from ..evaluation.patch_tree import irregular_patch
 from ..mesh.one_ring import one_ring
-from ..mesh.signature import signature_at
 from ..regression.tiers import normal_angle
 from ..schemes import scheme_named
 from ..schemes.domain import FloatArray
@@ -37,6 +36,7 @@ from .staging import (
     grid_points,
     grid_triangles,
     in_8_bits,
+    limit_surface,
     load_stage,
     make_mesh,
     project,
@@ -112,10 +112,8 @@ def draw_artifact(options: FigureOptions) -> list[Path]:
             offset = beside if is_beside else 0.0
             level, distance, error = vertex_normal(surface, evaluator, offset)
             location, caption = _caption(offset, level, error)
-            name = f"valence {valence}, {title}"
-            options.report(f"{name}: {location}; {caption}")
             scene = _scene_of(stage, surface, rate, evaluator, offset)
-            rendered.append(render(scene, options, name)[..., :3])
+            rendered.append(render(scene, options, f"valence {valence}, {title}")[..., :3])
             show(axis, in_8_bits(rendered[-1]), caption=f"{location}\n{caption}")
             _draw_lines(axis, scene, surface, surface.tessellate(rate, evaluator, np.float32, offset))
             record = {"valence": valence, "rule": title, "level": level, "offset": distance, "error": error}
@@ -152,16 +150,9 @@ def _caption(sample_offset: float, level: int | None, error: float) -> tuple[str
 def _scene_of(stage: mi.Scene, surface: LimitSurface, rate: int, evaluator: Evaluator, offset: float) -> mi.Scene:
     """The scene, with a surface in place of its own."""
     emitters = [shape for shape in stage.shapes() if shape.is_emitter()]
-    shape = {
-        "type": "subdivision",
-        **surface.cage.as_properties(mi),
-        "scheme": surface.scheme.name,
-        "tessellation_rate": rate,
-        "evaluator": evaluator,
-        "sample_offset": offset,
-        "bsdf": next(shape.bsdf() for shape in stage.shapes() if not shape.is_emitter()),
-    }
-    return staged(stage, emitters, surface=mi.load_dict(shape))
+    bsdf = next(shape.bsdf() for shape in stage.shapes() if not shape.is_emitter())
+    sampling = {"scheme": surface.scheme.name, "evaluator": evaluator, "sample_offset": offset}
+    return staged(stage, emitters, surface=limit_surface(surface.cage, rate, bsdf, **sampling))
 
 
 def _draw_lines(axis: Axes, scene: mi.Scene, surface: LimitSurface, tessellation: Tessellation) -> None:
@@ -255,58 +246,47 @@ def normal_errors(cage: ControlCage, exact: FloatArray, evaluator: Evaluator, dt
 
 def exact_normals(cage: ControlCage) -> NDArray[np.float64]:
     """Normals of the samples of all levels at vertex 0, from ``A^n C`` in 60-digit arithmetic: ``(levels * 4, 3)``."""
-    try:
-        import mpmath
-    except ImportError as error:
-        raise FigureError("the exact normals need mpmath: pip install 'mitsuba-subdivision[figures]'") from error
     scheme = scheme_named("catmull_clark")
+    patch = patch_of_valence(scheme, int(cage.topology.vertex_face_count[0]))
     # Vertex 0 is the first corner of face 0.
-    signature = signature_at(cage.topology, 0, scheme.element)
-    controls = one_ring(signature).gather(cage.topology, np.array([0]))[0]
-    patch = irregular_patch(scheme, signature)
-    if patch is None:
-        raise FigureError("vertex 0 is regular; expected an extraordinary vertex")
-
-    with mpmath.workdps(DIGITS):
-        # Rows are made to sum to one exactly: otherwise, rounding of the entries would add up over the levels.
-        tables = patch.matrix, *patch.children
-        matrix, *children = (_rows_to(1, mpmath.matrix(table.tolist())) for table in tables)
-        points = mpmath.matrix(cage.positions[controls].tolist())
+    controls = one_ring(patch.signature).gather(cage.topology, np.array([0]))[0]
+    with localcontext() as context:
+        context.prec = DIGITS
+        matrix, *children = (_exactly(table, 1) for table in (patch.matrix, *patch.children))
+        points = _exactly(cage.positions[controls])
         tangents = []
         for direction in DIRECTIONS:
             in_children = [child(direction) for child in scheme.domain.children[1:]]
             child = int(np.argmax([scheme.domain.inside(local) for local in in_children]))
-            basis = mpmath.matrix(scheme.regular_basis(in_children[child][None], 1)[1:, 0].tolist())
-            tangents.append(_rows_to(0, _rows_to(0, basis) * children[child]))
+            basis = _exactly(scheme.regular_basis(in_children[child][None], 1)[1:, 0], 0)
+            tangents.append(_exactly(basis @ children[child], 0))
+        along_u, along_v = np.stack(tangents, axis=1)
         normals = []
         for _ in LEVELS:
-            for rows in tangents:
-                (a, b, c), (d, e, f) = (rows * points).tolist()
-                normal = b * f - c * e, c * d - a * f, a * e - b * d
-                length = mpmath.sqrt(sum(x * x for x in normal))
-                normals.append([float(x / length) for x in normal])
-            points = matrix * points
-    return np.array(normals, dtype=np.float64)
+            normal = np.cross(along_u @ points, along_v @ points)
+            normals.append(normal / np.sqrt((normal**2).sum(axis=1, keepdims=True)))
+            points = matrix @ points
+    return np.concatenate(normals).astype(np.float64)
 
 
-def _rows_to(total: int, matrix: Any) -> Any:
-    """Correct the first entry of each row of an mpmath matrix, so that the row sums to a number exactly."""
-    for i in range(matrix.rows):
-        matrix[i, 0] += total - sum(matrix[i, :])
-    return matrix
+def _exactly(table: NDArray, row_sum: int | None = None) -> NDArray[np.object_]:
+    """Decimals of a table. Rows get a sum exactly, by their first entry: rounding would add up over the levels."""
+    exact = np.vectorize(Decimal, otypes=[object])(table)
+    if row_sum is not None:
+        exact[:, 0] += row_sum - exact.sum(axis=1)
+    return exact
 
 
 # Of the zoom: the surface at a vertex, magnified, with normals by (11), by (12), and by OpenSubdiv where `osd_peer` is.
 ZOOM_VALENCE, ZOOM_OFFSET = 5, 10
 MAGNIFICATIONS = (1, 100, 10_000, 1_000_000)
-Method = Evaluator | Literal["opensubdiv"]
-EVALUATORS: tuple[Evaluator, Evaluator] = ("stam", "stabilized")
 # The deepest level at which OpenSubdiv's patch tables can isolate extraordinary vertices.
-OPENSUBDIV: Literal["opensubdiv"] = "opensubdiv"
 OPENSUBDIV_LEVEL = 10
-LABELS: dict[str, str] = {
-    **{str(evaluator): EQUATIONS[evaluator] for evaluator in EVALUATORS},
-    OPENSUBDIV: f"OpenSubdiv\nlevel {OPENSUBDIV_LEVEL}",
+Method = Evaluator | Literal["opensubdiv"]
+METHODS: dict[Method, str] = {
+    "stam": EQUATIONS["stam"],
+    "opensubdiv": f"OpenSubdiv\nlevel {OPENSUBDIV_LEVEL}",
+    "stabilized": EQUATIONS["stabilized"],
 }
 # Half the width of the image at magnification 1: the elements at the point just fill it. The cage has the radius 1.
 HALF_WIDTH = 0.19
@@ -338,7 +318,7 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
     stage, resolution = load_stage("zoom", resolution=options.resolution), options.resolution
     sensor, count = stage.sensors()[0], max(resolution // 2, 8)
     triangles = grid_triangles(count, ZOOM_VALENCE)
-    rows = (EVALUATORS[0], OPENSUBDIV, EVALUATORS[1]) if osd_peer() else EVALUATORS
+    rows = [method for method in METHODS if method != "opensubdiv" or osd_peer()]
     figure, axes = panels(options, len(rows), len(MAGNIFICATIONS))
     rendered, records = [], []
     for magnification, column in zip(MAGNIFICATIONS, axes.T, strict=True):
@@ -348,11 +328,10 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
         centres = grid_points(np.arange(resolution) + 0.5).reshape(resolution, -1, 2)
         nearest = np.asarray(cKDTree(project(sensor, points, resolution)).query(centres)[1])
         lines = project(sensor, _level_lines(surface, magnification), resolution)
-        for evaluator, axis in zip(rows, column, strict=True):
-            normals, errors, median = normals_by(surface, uv, positions, exact, evaluator)
-            mesh = make_mesh(points, triangles, CLAY, normals=(normals @ frame(surface)[1]).reshape(-1, 3))
-            name = f"{LABELS[evaluator]}, x {magnification}".replace("\n", ", ")
-            options.report(f"{name}: median normal error {median:.1e} degrees")
+        for method, axis in zip(rows, column, strict=True):
+            normals, errors, median = normals_by(surface, uv, positions, exact, method)
+            mesh = make_mesh(points, triangles, CLAY, vertex_normals=(normals @ frame(surface)[1]).reshape(-1, 3))
+            name = f"{METHODS[method]}, x {magnification}".replace("\n", ", ")
             rendered.append(render(staged(stage, mesh=mesh), options, name))
             _draw_halves(axis, rendered[-1], errors.ravel()[nearest], lines)
             axis.set_xlabel(_degrees(median))
@@ -361,10 +340,10 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
             bar = AnchoredSizeBar(axis.transData, length, scientific(BAR / magnification), "lower left", pad=0.2, sep=2)
             bar.patch.set(alpha=0.85, linewidth=0)
             axis.add_artist(bar)
-            records.append({"evaluator": evaluator, "magnification": magnification, "error": median})
+            records.append({"evaluator": method, "magnification": magnification, "error": median})
         column[0].set_title(f"× {scientific(magnification)}\nu, v < {scientific(parameter_extent(magnification))}")
-    for axis, evaluator in zip(axes[:, 0], rows, strict=True):
-        axis.set_ylabel(LABELS[evaluator])
+    for axis, method in zip(axes[:, 0], rows, strict=True):
+        axis.set_ylabel(METHODS[method])
     scale = ScalarMappable(ERROR_SCALE, COLOURS)
     colours = figure.colorbar(scale, ax=axes, fraction=0.03, pad=0.01, aspect=45, extend="both")
     colours.set_label("error of the normal in degrees; medians below panels")
@@ -401,7 +380,7 @@ def normals_by(
     uv: FloatArray,
     positions: FloatArray,
     exact: FloatArray,
-    evaluator: Method,
+    method: Method,
 ) -> tuple[FloatArray, FloatArray, float]:
     """Normals by one of our evaluators or by OpenSubdiv, both in float32, ``(valence, s, 3)``.
 
@@ -409,13 +388,13 @@ def normals_by(
     image.
     """
     elements = np.arange(ZOOM_VALENCE)[:, None]
-    if evaluator == OPENSUBDIV:
+    if method == "opensubdiv":
         program = osd_peer()
         if program is None:
             raise FigureError("the program osd_peer is gone; expected it where it was found before")
         normals = osd_samples(program, surface.cage, elements, uv, "far", OPENSUBDIV_LEVEL)[1]
     else:
-        normals = surface.evaluate(elements, uv, evaluator=evaluator, dtype=np.float32).n.astype(np.float64)
+        normals = surface.evaluate(elements, uv, evaluator=method, dtype=np.float32).n.astype(np.float64)
     normals = np.nan_to_num(normals).reshape(exact.shape)
     # Where derivatives are parallel or vanish, there is no normal. That counts as the largest error.
     angle = np.where(normals.any(axis=-1), normal_angle(normals, exact), 180)

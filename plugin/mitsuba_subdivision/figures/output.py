@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -70,8 +69,6 @@ class FigureOptions:
     scheme: str = "catmull_clark"  # Subdivision scheme, for the figures that show one scheme of several
     # File of a Catmull-Clark cage to show in place of the figure's own, for the figures that take one
     cage: Path | None = None
-    # Is called with a line of text for each step
-    report: Callable[[str], Any] = lambda line: sys.stderr.write(f"{line}\n")
 
     def name_for_scheme(self, name: str) -> str:
         """Name of the files of a figure that shows one scheme of several."""
@@ -168,6 +165,6 @@ def label_powers(axis: Axis) -> None:
 
 
 def hide_frame(axis: Axes) -> None:
-    """Draw no frame and no ticks around a panel; unlike `set_axis_off`, this keeps its labels."""
-    axis.set(xticks=[], yticks=[])
+    """Draw no frame and no ticks around a panel of equal units; unlike `set_axis_off`, this keeps its labels."""
+    axis.set(xticks=[], yticks=[], aspect="equal")
     axis.spines[:].set_visible(False)

@@ -29,7 +29,6 @@ def draw_hero(options: FigureOptions) -> list[Path]:
     """Render the scene `human`: the limit surface of a human figure beside its cage."""
     width, height = picture_size(options)
     scene = load_stage("human", width=width, height=height)
-    options.report("mannequin")
     pixels = render(scene, options, "mannequin")[..., :3]
     return draw_picture(options, "hero", pixels, cage="human.obj, (c) 2010 Tobias Rittig")
 
@@ -95,7 +94,6 @@ def draw_displacement(options: FigureOptions) -> list[Path]:
     columns = [round(end * width) for end in ENDS]
     rendered = []
     for i, (name, jar) in enumerate(slices.items()):
-        options.report(name)
         first, count = columns[i], columns[i + 1] - columns[i]
         stage = load_stage("displacement", width=width, height=height, first_column=first, columns=count)
         rendered.append(render(staged(stage, jar=jar), options, name)[..., :3])

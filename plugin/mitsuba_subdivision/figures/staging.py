@@ -49,23 +49,18 @@ def make_mesh(
     positions: NDArray[np.floating],  # (n, 3)
     triangles: NDArray[np.integer],  # (m, 3) int
     bsdf: SceneNode,  # As for `mi.load_dict`
-    # (n, 3): unit normals of the vertices. Without them Mitsuba averages those of the triangles.
-    normals: NDArray[np.floating] | None = None,
-    face_colours: NDArray[np.floating] | None = None,  # (m, 3): mesh attribute `face_color`
+    **buffers: NDArray[np.floating],  # Others of `mitsuba_mesh`
 ) -> mi.Mesh:
-    """Make a Mitsuba mesh."""
-    buffers = {"vertex_positions": positions}
-    if normals is not None:
-        buffers["vertex_normals"] = normals
-    if face_colours is not None:
-        buffers["face_color"] = face_colours
-    return mitsuba_mesh("figure", triangles, buffers, bsdf=mi.load_dict(bsdf), averages_normals=normals is None)
+    """Make a Mitsuba mesh. Without `vertex_normals`, Mitsuba averages those of the triangles."""
+    averages = "vertex_normals" not in buffers
+    buffers["vertex_positions"] = positions
+    return mitsuba_mesh("figure", triangles, buffers, bsdf=mi.load_dict(bsdf), averages_normals=averages)
 
 
-def limit_surface(cage: ControlCage, rate: int, bsdf: SceneNode) -> mi.Shape:
+def limit_surface(cage: ControlCage, rate: int, bsdf: SceneNode | mi.BSDF, **parameters: Any) -> mi.Shape:
     """The limit surface of a cage, with so many segments per edge."""
-    properties = cage.as_properties(mi)
-    return mi.load_dict({"type": "subdivision", **properties, "tessellation_rate": rate, "bsdf": bsdf})
+    given = {**cage.as_properties(mi), "tessellation_rate": rate, "bsdf": bsdf, **parameters}
+    return mi.load_dict({"type": "subdivision", **given})
 
 
 def staged(stage: mi.Scene, shapes: Sequence[mi.Shape] | None = None, **objects: Any) -> mi.Scene:
@@ -179,7 +174,6 @@ def render_panels(
     rendered = []
     for (title, scene), axis in zip(scenes, axes.flat, strict=True):
         name, _, caption = title.partition("\n")
-        options.report(title.replace("\n", ", "))
         rendered.append(render(scene, options, name)[..., :3])
         show(axis, in_8_bits(rendered[-1]), name, caption)
     return rendered

@@ -61,7 +61,7 @@ WRONG = np.array([240, 90, 30])
 RING = "#0a84c6"
 
 
-def draw(options: FigureOptions) -> list[Path]:
+def draw_zebra(options: FigureOptions) -> list[Path]:
     """Render a mirror in the shape of a cube's limit surface amid stripes, with the normals of several methods.
 
     These are the exact normals; a mesh of level 3 with averaged normals; and, where their programs are found,
@@ -79,7 +79,6 @@ def draw(options: FigureOptions) -> list[Path]:
     # Shading normals where a few rays of each pixel hit, (rays, height, width, 3).
     aov, pixels, normals = mi.load_dict({"type": "aov", "aovs": "normal:sh_normal"}), {}, {}
     for name, shape in shapes.items():
-        options.report(f"reflection lines: {name}")
         scene = staged(stage, shape=shape, stripes=stripes)
         pixels[name] = render(scene, options, f"reflection lines: {name}")
         rays = [render_pixels(scene, seed, 1, integrator=aov)[..., -3:] for seed in range(NORMAL_RAYS)]
@@ -87,8 +86,6 @@ def draw(options: FigureOptions) -> list[Path]:
     # All surfaces get the same rays. The median leaves out a ray that slips between two triangles.
     exact = normals.pop("exact")
     angles = {name: np.median(np.nan_to_num(normal_angle(exact, n)), axis=0) for name, n in normals.items()}
-    for name, angle in angles.items():
-        options.report(f"{' '.join(titles[name])}: normals differ by up to {angle.max():.2f} degrees")
     tip = surface.evaluate(at[0], np.zeros((1, 2)), at[1]).p
 
     figure, axes = panels(options, 2, len(shapes))
@@ -124,12 +121,12 @@ def _shapes(cage: ControlCage, level: int) -> tuple[dict[str, Any], dict[str, tu
         uv, shown = grid_points(np.linspace(0, 1, 2**level + 1)), np.flatnonzero(~cage.is_hole)
         points, normals = osd_samples(program, cage, shown[:, None], uv, "bfr", OPENSUBDIV_LEVEL)
         triangles = grid_triangles(2**level, len(shown))
-        shapes["opensubdiv"] = make_mesh(points, triangles, MIRROR, normals=normals)
+        shapes["opensubdiv"] = make_mesh(points, triangles, MIRROR, vertex_normals=normals)
         titles["opensubdiv"] = ("OpenSubdiv", f"level {OPENSUBDIV_LEVEL},\nown normals")
     # Blender has no holes.
     if not len(cage.holes) and (program := blender()):
         points, normals, quads, version = blender_mesh(program, cage, level)
-        shapes["blender"] = make_mesh(points, split_quads(quads), MIRROR, normals=normals)
+        shapes["blender"] = make_mesh(points, split_quads(quads), MIRROR, vertex_normals=normals)
         titles["blender"] = (f"Blender {version}", f"level {level},\naveraged normals")
     return shapes, titles
 
