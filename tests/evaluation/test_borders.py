@@ -92,13 +92,6 @@ def test_a_border_is_a_cubic_spline_between_its_corners():
     assert np.abs(points - weights.T @ [a, b, c, d]).max() <= POSITION
 
 
-def test_corners_stay_and_other_ends_of_the_border_do_not():
-    for boundary, stays in (("edge_and_corner", True), ("edge_only", False)):
-        cage = sheet(2, 2, boundary=boundary)
-        corner = LimitSurface(cage).evaluate(0, [[0.0, 0.0]]).p[0]
-        assert (np.abs(corner - cage.positions[0]).max() <= POSITION) == stays
-
-
 def test_a_crease_has_one_position_and_two_normals():
     cage = tagged(cube(), creases=[(4, 5, INFINITE), (5, 7, INFINITE), (7, 6, INFINITE), (6, 4, INFINITE)])
     t, along = cage.topology, np.linspace(0, 1, 7)
@@ -109,12 +102,6 @@ def test_a_crease_has_one_position_and_two_normals():
     )
     assert np.abs(one.p - other.p).max() <= POSITION
     assert angle(one.n, other.n).min() > 10
-
-
-def test_a_dart_is_smooth_at_its_end():
-    surface = LimitSurface(bumpy(spokes(extraordinary(5), 5, [INFINITE])))
-    normals = [surface.evaluate(face, [[0.0, 0.0]]).n[0] for face in range(5)]
-    assert max(angle(normals[0], normal) for normal in normals) <= NORMAL
 
 
 def test_a_corner_of_two_triangles_is_touched_by_the_plane_of_its_border_edges():

@@ -64,20 +64,6 @@ def test_fans_that_share_a_vertex_are_apart(spokes):
         assert len(copies_of_fan) == max(1, sum(spoke in first for spoke in spokes))
 
 
-@pytest.mark.parametrize("rate", [1, 2, 5])
-def test_tessellations_have_no_cracks_along_edges_of_many_faces(rate):
-    pages = 3
-    t = msub.LimitSurface(book(pages)).tessellate(rate)
-    # Edges are told apart by the positions of their ends.
-    _, place = np.unique(t.positions, axis=0, return_inverse=True)
-    corners = place.ravel()[t.triangles]
-    edges = np.sort(np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]]), axis=1)
-    counts = np.bincount(np.unique(edges, axis=0, return_counts=True)[1])
-    assert counts[3] == 3 * rate
-    # Of each page: two sides of two edges and the far one of three.
-    assert counts[1] == pages * (2 * 2 + 3) * rate
-
-
 def turned_over(cage, faces):
     return [face[:: -1 if f in faces else 1].tolist() for f, face in enumerate(faces_of(cage))]
 

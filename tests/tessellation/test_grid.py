@@ -54,16 +54,3 @@ def test_triangles_cover_the_domain_once(domain):
             areas = np.linalg.det(parameters[:, 1:] - parameters[:, :1]) / 2
             assert (areas > 0).all()
             assert areas.sum() == pytest.approx(domain.area, abs=ROUNDING)
-
-
-@pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
-@pytest.mark.parametrize("rate", [1, 2, 5])
-def test_faces_without_corners_leave_nothing_behind(scheme, rate):
-    t = cage_of(scheme, "cube").topology
-    # All faces around a vertex, which then is no part of the surface.
-    at_vertex, sizes = np.unique(t.face[t.face_vertices == 0]), t.face_sizes.copy()
-    sizes[at_vertex] = 0
-    kept = t.face_vertices[sizes[t.face] > 0]
-    grid = UniformGrid(scheme_named(scheme).domain, Topology(t.vertex_count, sizes, kept), rate)
-    np.testing.assert_array_equal(np.unique(grid.triangles()), np.arange(grid.vertex_count))
-    assert not np.isin(at_vertex, grid.element()).any()
