@@ -413,9 +413,8 @@ def _least_joined(
     """``(count,)`` the least of all numbers that pairs join to each number, directly or through others."""
     least = np.arange(count, dtype=np.int32)
     while True:
-        joined, of_pair = least.copy(), least[pairs].min(axis=0)
-        for numbers in pairs:
-            np.minimum.at(joined, numbers, of_pair)
+        joined = least.copy()
+        np.minimum.at(joined, pairs.ravel(), np.tile(least[pairs].min(axis=0), 2))
         joined = joined[joined]
         if np.array_equal(joined, least):
             return least

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from bisect import bisect_right
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
@@ -83,16 +81,9 @@ def available_memory(
     from pathlib import Path
 
     root = Path(root)
-    return min((max(left, 0) for left in (*_of_machine(root), *_of_groups(root), *_of_process(root))), default=None)
-
-
-def _of_machine(root: Path) -> Iterator[int]:
-    lines = _lines(root / "proc/meminfo")
-    available = [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
-    try:
-        yield available[0] if available else os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return
+    machine = [line.split()[1] for line in _lines(root / "proc/meminfo") if line.startswith("MemAvailable:")]
+    left = [*(1024 * int(kilobytes) for kilobytes in machine), *_of_groups(root), *_of_process(root)]
+    return min((max(count, 0) for count in left), default=None)
 
 
 def _of_groups(root: Path) -> Iterator[int]:
@@ -120,13 +111,13 @@ def _of_groups(root: Path) -> Iterator[int]:
 
 
 def _of_process(root: Path) -> Iterator[int]:
-    if sys.platform == "win32":
-        return
-    import resource
+    pages = _lines(root / "proc/self/statm")
+    if pages:
+        import resource
 
-    allowed, used = resource.getrlimit(resource.RLIMIT_AS)[0], _lines(root / "proc/self/statm")
-    if allowed != resource.RLIM_INFINITY and used:
-        yield allowed - int(used[0].split()[0]) * resource.getpagesize()
+        allowed = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if allowed != resource.RLIM_INFINITY:
+            yield allowed - int(pages[0].split()[0]) * resource.getpagesize()
 
 
 def _lines(path: Path) -> list[str]:
