@@ -40,7 +40,7 @@ class Sample(NamedTuple):
 
 
 class Limit(NamedTuple):
-    """Point and unit normal of the limit surface at a vertex or face centre."""
+    """Point and unit normal of the limit surface."""
 
     p: np.ndarray
     n: np.ndarray
@@ -119,32 +119,20 @@ class BruteForce:
         area = aa * bb - ab * ab
         return Sample(p, a, b, *second, n, ((e * g - f * f) / area, (e * bb - 2 * f * ab + g * aa) / (2 * area)), level)
 
-    def limit(self, vertex: int | None = None, face: int | None = None) -> Limit:
-        """Limit point and normal at a vertex (Catmull-Clark, Loop), or at the centre of a face (not for Loop).
-
-        For a vertex with Doo-Sabin: the centre of the face which the vertex becomes.
-        """
+    def limit(self, at: int) -> Limit:
+        """Limit point and normal at a vertex, for Doo-Sabin at the centre of a face."""
         with precision(self.digits):
+            if self.scheme == "doo_sabin":
+                points = [self.points[v] for v in self.faces[at]]
+                valence = len(points)
+            else:
+                fan = ring(at, self.faces)
+                points, valence = [self.points[v] for v in (at, *(f[1] for f in fan))], len(fan)
             if self.scheme == "catmull_clark":
                 # One refinement makes all faces quads; the ring is then edges and far corners of the new quads.
-                around = self._touching(self.faces[face] if vertex is None else [vertex], self.faces)
-                if vertex is None:
-                    around.sort(key=lambda f: f != self.faces[face])
-                refined, point = self.rules(around, self.points)
-                centre = ("face", 0) if vertex is None else ("vertex", vertex)
-                fan = ring(centre, refined)
-                keys = [centre, *(f[1] for f in fan), *(f[2] for f in fan)]
-                points = [point(key) for key in keys]
-            elif self.scheme == "loop":
-                fan = ring(vertex, self.faces)
-                points = [self.points[v] for v in (vertex, *(f[1] for f in fan))]
-            elif vertex is None:
-                points = [self.points[v] for v in self.faces[face]]
-            else:
-                fan = ring(vertex, self.faces)
-                _, point = self.rules(fan, self.points)
-                points = [point((vertex, k)) for k in range(len(fan))]
-            valence = len(points) if self.scheme == "doo_sabin" else len(fan)
+                refined, point = self.rules(self._touching([at], self.faces), self.points)
+                fan = ring(("vertex", at), refined)
+                points = [point(key) for key in (("vertex", at), *(f[1] for f in fan), *(f[2] for f in fan))]
             p, tangent1, tangent2 = (combine(mask, points) for mask in limit_masks(self.scheme, valence))
             return Limit(p, unit_normal(tangent1, tangent2))
 

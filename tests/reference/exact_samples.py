@@ -133,7 +133,7 @@ def samples_at(scheme: str, valence: int, levels: tuple[int, ...] = LEVELS) -> E
         deep = reference.evaluate(0, 0, 2.0**-60, 0)
         limit = deep.p, deep.n
     else:
-        limit = reference.limit(**{"face" if scheme == "doo_sabin" else "vertex": 0})
+        limit = reference.limit(0)
     p, dp_du, dp_dv, *second, n, curvature, _ = (np.array(values, dtype=float) for values in zip(*samples, strict=True))
     return ExactSamples(
         scheme, valence, cage, uv, p, dp_du, dp_dv, n, np.stack(second), curvature.T, *np.array(limit, dtype=float)

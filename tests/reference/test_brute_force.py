@@ -82,21 +82,21 @@ def test_rules_have_the_stated_weights():
 
 # Scheme, cage, extraordinary point, and an element with its corner that has (0, 0) there.
 LIMITS = [
-    ("catmull_clark", without_symmetry(trapezohedron(3)), {"vertex": 0}, 0, 0),
-    ("catmull_clark", without_symmetry(trapezohedron(5)), {"vertex": 1}, 0, 1),
-    ("loop", without_symmetry(bipyramid(3)), {"vertex": 0}, 0, 0),
-    ("loop", without_symmetry(bipyramid(5)), {"vertex": 1}, 0, 1),
-    ("doo_sabin", without_symmetry(prism(3)), {"face": 0}, 0, 0),
-    ("doo_sabin", without_symmetry(prism(5)), {"face": 0}, 2, 0),
+    ("catmull_clark", without_symmetry(trapezohedron(3)), 0, 0, 0),
+    ("catmull_clark", without_symmetry(trapezohedron(5)), 1, 0, 1),
+    ("loop", without_symmetry(bipyramid(3)), 0, 0, 0),
+    ("loop", without_symmetry(bipyramid(5)), 1, 0, 1),
+    ("doo_sabin", without_symmetry(prism(3)), 0, 0, 0),
+    ("doo_sabin", without_symmetry(prism(5)), 0, 2, 0),
 ]
 
 
 @pytest.mark.parametrize(("scheme", "cage", "at", "element", "corner"), LIMITS)
 def test_samples_tend_to_the_limit_and_digits_are_enough(scheme, cage, at, element, corner):
     if scheme == "doo_sabin":
-        corner = [sorted(f) for f in ring(element, cage[1])].index(sorted(cage[1][at["face"]]))
+        corner = [sorted(f) for f in ring(element, cage[1])].index(sorted(cage[1][at]))
     reference = BruteForce(scheme, *cage)
-    expected, near = reference.limit(**at), reference.evaluate(element, corner, 2.0**-200, 2.0**-200)
+    expected, near = reference.limit(at), reference.evaluate(element, corner, 2.0**-200, 2.0**-200)
     # Normals differ by (lambda_4 / lambda_2)^n, which is 2^-n or less for all of these but Catmull-Clark and Loop above
     # valence 4; positions by lambda_2^n.
     assert np.abs(near.p - expected.p).max() < Decimal(2) ** -99
