@@ -174,6 +174,4 @@ def test_without_the_hook_automatic_shading_is_by_normals_of_vertices(monkeypatc
     # A trial that fails is a reason, too.
     monkeypatch.setattr(interaction_hook, "hook_problem", lambda: None)
     monkeypatch.setattr(interaction_hook, "interaction_hook", fail)
-    interaction_hook._problem_of_variant.cache_clear()
     assert problem() == "exact shading needs the virtual functions of Mitsuba 3.9"
-    interaction_hook._problem_of_variant.cache_clear()
