@@ -10,137 +10,6 @@ from mitsuba_subdivision.cage import Attribute
 from mitsuba_subdivision.cage.named_cages import cube
 from reference.refined_cages import tagged
 
-_OBJ = b"""# a sheet
-o sheet
-v 0 0 0
-v 1 0 0 1 0 0
-v 2 0 0
-v 0 1e0 0
-v 1 1 -0.5
-v 2 1 0
-vt 0 0
-vt 1 0 0
-vt .5 1
-usemtl red
-f 1/1/1 2/2/1 5/3/1 4/1/1
-f -5/1 -4/2 -1/3 \\
- -2/1
-t crease 2/1/0 0 1 2.5
-t crease 4/2/0 1 2 2 5 1 10
-t corner 1/1/0 3 10
-t hole 1/0/0 0
-t interpolateboundary 1/0/0 1
-t creasemethod 0/0/1 chaikin
-t facevaryingpropagatecorners 1/0/0 1
-"""
-_PLY = b"""ply
-format ascii 1.0
-comment a sheet of two faces
-obj_info 3
-element vertex 5
-property float x
-property double y
-property float z
-property uchar red
-property uchar green
-property uchar blue
-property short flow_0
-property float flow_1
-element edge 1
-property int vertex1
-property int8 vertex2
-element face 2
-property list uchar int vertex_indices
-property uint flags
-end_header
-0 0 0 255 0 0 1 2
-1 0 0 255 0 0 1 2
-1 1 0 255 0 0 1 2
-0 1 0 255 0 0 1 2
-2 0.1 0 255 0 0 1 1e3
-0 1
-4 0 1 2 3 7
-3 1 4 2 8
-"""
-_USD = b"""#usda 1.0
-( defaultPrim = "World"
-  upAxis = "Z" )
-def Xform "World" {
-    double3 xformOp:translate = (10, 20, 30)
-    float xformOp:rotateZ.timeSamples = { 1: 0, 5: 90 }
-    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateZ"]
-    def Mesh "sheet" (
-        kind = "component"
-    ) {
-        uniform token orientation = "leftHanded"
-        uniform token subdivisionScheme = "catmullClark"
-        point3f[] points = [(0, 0, 0), (1, 0, 0), (2, 0, 0), (0, 1, 0), (1, 1, 0), (2, 0.5, 0)]
-        point3f[] points.timeSamples = { 1: [(0, 0, 0), (1, 0, 0)], 2: [] }
-        int[] faceVertexCounts = [4, 4]
-        int[] faceVertexIndices = [0, 1, 4, 3, 1, 2, 5, 4]
-        int[] creaseIndices = [0, 1, 2]
-        int[] creaseLengths = [3]
-        float[] creaseSharpnesses = [2.5]
-        int[] cornerIndices = [5, 0]
-        float[] cornerSharpnesses = [10, 1.5]
-        int[] holeIndices = [1]
-        token interpolateBoundary = "edgeOnly"
-        token faceVaryingLinearInterpolation = "all"
-        texCoord2f[] primvars:st = [(0, 0), (.5, 0), (1, 0), (0, 1), (1, 1)] (interpolation = "faceVarying")
-        int[] primvars:st:indices = [0, 1, 4, 3, 1, 2, 2, 4]
-        color3f[] primvars:displayColor = [(1, 0, 0), (0, 1, 0)] (interpolation = "vertex")
-        int[] primvars:displayColor:indices = [0, 1, 0, 1, 1, 0]
-        float[] primvars:pair = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11] (
-            interpolation = "vertex"
-            elementSize = 2
-        )
-        int[] primvars:ids = [0, 1, 2, 3, 4, 5] (interpolation = "vertex")
-        rel material:binding = </World/red>
-    }
-}
-"""
-_USD_ARCS = b"""#usda 1.0
-( subLayers = [@./missing.usda@ (offset = 1; scale = 2)] )
-class "Model" (
-    variants = { string look = "a" }
-    prepend variantSets = "look"
-) {
-    def Mesh "part" {
-        point3f[] points.timeSamples = { 1: [], 2: [(0, 0, 0), (1, 0, 0), (0, 1, 0)], 4: None }
-        int[] faceVertexCounts.timeSamples = { 2: [3] }
-        int[] faceVertexIndices = [0, 1, 2]
-        uniform token subdivisionScheme = "loop"
-    }
-    variantSet "look" = {
-        "a" {
-            over "part" {
-                token visibility = "inherited"
-            }
-        }
-        "b" {
-            over "part" {
-                token visibility = "invisible"
-            }
-        }
-    }
-}
-def Xform "a" (
-    instanceable = true
-    inherits = </Model>
-) {
-    matrix4d xformOp:transform = ((1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (5, 0, 0, 1))
-    uniform token[] xformOpOrder = ["!resetXformStack!", "xformOp:transform"]
-}
-def "b" (
-    references = </Model> (offset = 10)
-    payload = @./missing.usdc@</World>
-) {
-    over "part" {
-        uniform token subdivisionScheme = "none"
-    }
-}
-"""
-
 WORDS = {
     "obj": b"""v vn vt f t o g usemtl l crease corner hole 2/1/0 1/1/0 0/0/1 1/0/0 99/1/0 1/2/3 1//3 1/2 -1/-1 0/0
         interpolateboundary facevaryinginterpolateboundary creasemethod smoothtriangles normal chaikin vertexedit
@@ -156,19 +25,19 @@ WORDS = {
 }  # fmt: skip
 
 
-# With every end of a line. Of USD files, texts only: the library trusts the sizes that its binary files announce.
-_LITERAL = {
-    "obj": [_OBJ.replace(b"\n", end) for end in (b"\n", b"\r\n")],
-    "ply": [_PLY.replace(b"\n", end) for end in (b"\n", b"\r\n", b"\r")],
-    "usd": [_USD, _USD_ARCS],
-}
+# Of USD files, texts only: the library trusts the sizes that its binary files announce.
+_SEEDS = Path(__file__).with_name("seeds")
+# Ends of lines that files of a kind have.
+_ENDS = {"obj": (b"\n", b"\r\n"), "ply": (b"\n", b"\r\n", b"\r"), "usd": (b"\n",)}
 
 
 @cache
 def seed_files(reader: str) -> list[tuple[str, bytes]]:
     """Suffix and content of each valid file of a kind: obj, ply or usd."""
     suffix = ".usda" if reader == "usd" else f".{reader}"
-    return [(suffix, content) for content in (*_LITERAL[reader], *_written(reader, suffix))]
+    literal = [path.read_bytes() for path in sorted(_SEEDS.glob(f"*{suffix}"), reverse=True)]
+    with_ends = [content.replace(b"\n", end) for content in literal for end in _ENDS[reader]]
+    return [(suffix, content) for content in (*with_ends, *_written(reader, suffix))]
 
 
 def _written(reader: str, suffix: str) -> Iterator[bytes]:
