@@ -74,17 +74,12 @@ PYTEST_TWICE = """import pytest
 for option in ("--render-update-all", "--render-report=none"):
     pytest.main(["-q", "-p", "no:cacheprovider", "-p", "no:hypothesispytest", option])
 """
-END_OF_HELP = "= end of help =\n"
-HELP_OF_SCRIPTS = f"""import os, runpy, sys
-for path, name in zip(sys.argv[1::2], sys.argv[2::2]):
-    sys.argv = [path, "--help"]
-    sys.path.insert(0, os.path.dirname(path))
-    try:
-        runpy.run_path(path, run_name=name)
-    except SystemExit as end:
-        assert not end.code, end
-    del sys.path[0]
-    print({END_OF_HELP!r}, end="")
+# Prints the help of a script, if it has one.
+HELP = """import os, runpy, sys
+path, name = sys.argv[1:]
+sys.argv = [path, "--help"]
+sys.path.insert(0, os.path.dirname(path))
+runpy.run_path(path, run_name=name)
 """
 
 
@@ -176,20 +171,15 @@ def requirements(extra):
         yield from itertools.chain(*map(requirements, extras.split(","))) if name == OURS else [name]
 
 
-def check_scripts(scripts):
-    """Load scripts, which take long, one after the other in one process, and find their options in their help."""
-    arguments = []
-    for path, *words in scripts:
-        program = ROOT / path / "__main__.py" if (ROOT / path).is_dir() else ROOT / path
-        has_options = "argparse" in program.read_text(encoding="utf-8")
-        assert has_options or not any(word.startswith("--") for word in words), path
-        arguments += [path, "__main__" if has_options else "imported"]
-    command, wide = [sys.executable, "-c", HELP_OF_SCRIPTS, *arguments], {**os.environ, "COLUMNS": "200"}
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    done = subprocess.run(command, cwd=ROOT, env=wide, timeout=120, check=False, **streams)
-    assert done.returncode == 0, done.stdout
-    for (path, *words), said in zip(scripts, done.stdout.split(END_OF_HELP)[:-1], strict=True):
-        assert [word for word in words if word.startswith("--") and word not in said] == [], path
+def check_script(path, *words):
+    """Load a script, which takes long, and find the options of a command in its help."""
+    program = ROOT / path / "__main__.py" if (ROOT / path).is_dir() else ROOT / path
+    has_options = "argparse" in program.read_text(encoding="utf-8")
+    command = [sys.executable, "-c", HELP, path, "__main__" if has_options else "imported"]
+    wide = {**os.environ, "COLUMNS": "200"}
+    done = subprocess.run(command, cwd=ROOT, env=wide, timeout=120, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert [word for word in words if word.startswith("--") and word not in done.stdout] == [], path
 
 
 def module(words):
@@ -214,8 +204,7 @@ def module(words):
 
 
 def run_commands(block):
-    """Run the program's commands; check all others. Returns the words of scripts."""
-    scripts = []
+    """Run the program's commands; check all others."""
     for words in block.commands:
         first, *rest = words
         if first == OURS and block.mark.endswith(OPTIONS_ONLY):
@@ -227,7 +216,7 @@ def run_commands(block):
             module(rest[1:])
         elif first == "python":
             if find_spec("resource"):  # Windows lacks it, and scripts that measure need it.
-                scripts.append(rest)
+                check_script(*rest)
         elif first == "pip":
             module(words)
         elif first == "export":
@@ -243,12 +232,11 @@ def run_commands(block):
             assert os.access(ROOT / first, os.X_OK), words
         else:
             assert first in requirements("dev"), words
-    return scripts
 
 
 def run_blocks(page, folder):
     """Run all blocks of a page; returns the names that its Python has made."""
-    names, scripts = {"__name__": "example"}, []
+    names = {"__name__": "example"}
     for block in blocks(page):
         if block.mark == "pytest":
             run_as_tests(block, folder)
@@ -259,11 +247,9 @@ def run_blocks(page, folder):
             shapes = mi.load_file(str(folder / "example.xml")).shapes()
             assert [type(shape).__name__ for shape in shapes] == ["Subdivision"], block
         elif block.language == "sh":
-            scripts += run_commands(block)
+            run_commands(block)
         else:
             assert block.language == "bibtex", block
-    if scripts:
-        check_scripts(scripts)
     return names
 
 
