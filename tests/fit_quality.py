@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 import resource
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -71,11 +71,10 @@ class Course(NamedTuple):
     last: float
     bending: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    def rates(self, steps: int) -> list[tuple[float, float]]:
-        return [(0, self.rate), (self.falling * steps, self.rate), (steps, self.last * self.rate)]
-
-    def bendings(self, steps: int) -> list[tuple[float, float]]:
-        return list(zip((0, self.falling * steps, steps), self.bending, strict=True))
+    def schedule(self, steps: int, values: Sequence[float] = ()) -> list[tuple[float, float]]:
+        """Of the rate, or of other values at the three times."""
+        times = 0, self.falling * steps, steps
+        return list(zip(times, values or (self.rate, self.rate, self.last * self.rate), strict=True))
 
 
 # Thin parts want a surface that stays smooth for long, and to the end where pictures tell little of them; where there
@@ -107,15 +106,13 @@ class Triangles(NamedTuple):
     @classmethod
     def averaged(cls, positions: np.ndarray, triangles: np.ndarray) -> Triangles:
         """With the averages of the triangles' normals, by area."""
-        a, b, c = positions[triangles].swapaxes(0, 1)
         normals = np.zeros_like(positions)
-        np.add.at(normals, triangles, np.cross(b - a, c - a)[:, None])
+        np.add.at(normals, triangles, crosses(positions, triangles)[:, None])
         return cls(positions, unit(normals), triangles)
 
     def samples(self, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
         """Random points, uniform by area, and their normals."""
-        a, b, c = self.positions[self.triangles].swapaxes(0, 1)
-        areas, rng = np.linalg.norm(np.cross(b - a, c - a), axis=1), np.random.default_rng(seed)
+        areas, rng = np.linalg.norm(crosses(self.positions, self.triangles), axis=1), np.random.default_rng(seed)
         chosen, weights = rng.choice(len(areas), count, p=areas / areas.sum()), rng.dirichlet(np.ones(3), count)
         corners, weights = self.triangles[chosen], weights[:, :, None]
         points, normals = ((each[corners] * weights).sum(axis=1) for each in (self.positions, self.normals))
@@ -123,14 +120,19 @@ class Triangles(NamedTuple):
 
     def folded(self) -> float:
         """Part of the triangles that face away from all of their neighbours taken together."""
-        a, b, c = self.positions[self.triangles].swapaxes(0, 1)
-        normals = np.cross(b - a, c - a)
+        normals = crosses(self.positions, self.triangles)
         sides = np.sort(self.triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         edges, edge = np.unique(sides, axis=0, return_inverse=True)
         own, total = np.repeat(normals, 3, axis=0), np.zeros((len(edges), 3))
         np.add.at(total, edge.ravel(), own)
         others = (total[edge.ravel()] - own).reshape(-1, 3, 3).sum(axis=1)
         return float(((others * normals).sum(axis=1) < 0).mean())
+
+
+def crosses(positions: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """Normals of triangles, twice as long as their areas."""
+    a, b, c = positions[triangles].swapaxes(0, 1)
+    return np.cross(b - a, c - a)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -155,11 +157,11 @@ def main() -> None:
         views = pictures(target)
         for kind, fitted, courses in (("cage", fitted_cage, CAGE_COURSES), ("mesh", fitted_mesh, MESH_COURSES)):
             found = []
-            for each, course in courses.items():
+            for course_name, course in courses.items():
                 results = [fitted(target, views, course, seed, options.steps) for seed in range(options.seeds)]
                 _, distance, _, folded, _ = np.median(results, axis=0)
                 # Courses whose surfaces fold come after those whose do not.
-                found.append((folded > 0, distance, f"{kind} {each}", results))
+                found.append((folded > 0, distance, f"{kind} {course_name}", results))
             for *_, title, results in sorted(found) if options.all else [min(found)]:
                 report(name, title, results)
     if "creases" in options.targets:
@@ -233,26 +235,20 @@ def mesh_shape(mesh: Triangles) -> mi.Mesh:
     return mitsuba_mesh("mesh", mesh.triangles, buffers, bsdf=mi.load_dict(BSDF), averages_normals=True)
 
 
-def sensors(target: Triangles) -> list[dict]:
-    """Cameras around a target, which it fills."""
+def pictures(target: Triangles, spp: int = TARGET_SPP) -> list[View]:
+    """Of a target, by cameras around it, which it fills."""
+    scene, views = mi.load_dict({"type": "scene", **STAGE, "target": mesh_shape(target)}), []
     radius = np.linalg.norm(target.positions, axis=1).max()
     fov = float(np.degrees(2 * np.arcsin(MARGIN * radius / DISTANCE)))
-    size = {"width": RESOLUTION, "height": RESOLUTION}
-    film, found = {"type": "hdrfilm", **size, "rfilter": {"type": "box"}, "sample_border": True}, []
+    film = {"type": "hdrfilm", "width": RESOLUTION, "height": RESOLUTION, "rfilter": {"type": "box"}}
+    film["sample_border"] = True
     for view in range(VIEWS):
         angle, rise = 2 * np.pi * view / VIEWS, np.radians(25) * (1 if view % 2 else -1)
         place = DISTANCE * np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
         to_world = mi.ScalarTransform4f().look_at(place.tolist(), [0, 0, 0], [0, 0, 1])
-        found.append({"type": "perspective", "fov": fov, "to_world": to_world, "film": film})
-    return found
-
-
-def pictures(target: Triangles, spp: int = TARGET_SPP) -> list[View]:
-    scene = mi.load_dict({"type": "scene", **STAGE, "target": mesh_shape(target)})
-    return [
-        View(sensor, mi.render(scene, sensor=mi.load_dict(sensor), spp=spp, seed=1000 + view))
-        for view, sensor in enumerate(sensors(target))
-    ]
+        sensor = {"type": "perspective", "fov": fov, "to_world": to_world, "film": film}
+        views.append(View(sensor, mi.render(scene, sensor=mi.load_dict(sensor), spp=spp, seed=1000 + view)))
+    return views
 
 
 def fitted_cage(target: Triangles, views: list[View], course: Course, seed: int, steps: int) -> Result:
@@ -262,9 +258,12 @@ def fitted_cage(target: Triangles, views: list[View], course: Course, seed: int,
         views,
         STAGE,
         shape={"bsdf": BSDF},
-        learning_rate=course.rates(steps),
+        learning_rate=course.schedule(steps),
         smoothing=LAMBDA,
-        regularizers={"bending": course.bendings(steps), "folds": [(steps // 4 + 1, 0), (steps, FOLDS)]},
+        regularizers={
+            "bending": course.schedule(steps, course.bending),
+            "folds": [(steps // 4 + 1, 0), (steps, FOLDS)],
+        },
         refine=[steps // 4],
         spp=SPP,
         edge_spp=EDGE_SPP,
@@ -286,7 +285,7 @@ def fitted_mesh(target: Triangles, views: list[View], course: Course, seed: int,
     large_steps = mi.ad.LargeSteps(params[key], params["mesh.faces"], MESH_LAMBDA)
     optimizer = mi.ad.Adam(lr=1.0, uniform=True)
     optimizer["u"] = large_steps.to_differential(params[key])
-    rates = Schedule.of(course.rates(steps), "rate")
+    rates = Schedule.of(course.schedule(steps), "rate")
 
     def loss(image: mi.TensorXf, view: int) -> mi.Float:
         return dr.mean(dr.square(image - targets[view]), axis=None)
