@@ -59,16 +59,6 @@ WRITTEN = {
     "python": {"barrel.obj"},
     "render": {"human.png", "jar.png", "rook.xml", "edited.png", "warm.png", "turn_0003.png", "turn.gif"},
 }
-SCENE = """<scene version="3.0.0">
-    <integrator type="direct"/>
-    <sensor type="perspective">
-        <transform name="to_world"><lookat origin="0, -4, 1" target="0, 0, 0" up="0, 0, 1"/></transform>
-        <film type="hdrfilm"><integer name="width" value="8"/><integer name="height" value="8"/></film>
-    </sensor>
-    <shape type="sphere"/>
-    <emitter type="constant"/>
-</scene>"""
-
 # References are written, and compared.
 PYTEST_TWICE = """import pytest
 for option in ("--render-update-all", "--render-report=none"):
@@ -156,7 +146,7 @@ def run_python(block, names):
 
 def run_as_tests(block, folder):
     """Run a block as a file of tests, which first write their references."""
-    (folder / "scenes" / "my_scene.xml").write_text(SCENE)
+    shutil.copy(ROOT / "tests" / "data" / "ball.xml", folder / "scenes" / "my_scene.xml")
     (folder / "test_example.py").write_text(block.text)
     command = [sys.executable, "-c", PYTEST_TWICE]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)

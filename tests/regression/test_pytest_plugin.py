@@ -2,6 +2,7 @@
 
 import json
 import os
+from pathlib import Path
 
 import flip_evaluator  # noqa: F401
 import matplotlib.pyplot  # noqa: F401
@@ -16,16 +17,7 @@ from mitsuba_subdivision.regression.image import load_image
 
 pytest_plugins = ["pytester"]
 
-SCENE = """<scene version="3.0.0">
-    <default name="albedo" value="0.5"/>
-    <integrator type="direct"/>
-    <sensor type="perspective">
-        <transform name="to_world"><lookat origin="0, -4, 1" target="0, 0, 0" up="0, 0, 1"/></transform>
-        <film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="16"/></film>
-    </sensor>
-    <shape type="sphere"><bsdf type="diffuse"><rgb name="reflectance" value="$albedo"/></bsdf></shape>
-    <emitter type="constant"/>
-</scene>"""
+SCENE = (Path(__file__).parents[1] / "data" / "ball.xml").read_text()
 TEST = """
 def test_ball(render_regression):
     render_regression("ball.xml", spp=32, reference_spp=512, batch=16, variant="scalar_rgb")
@@ -74,7 +66,7 @@ def with_reference(project, written):
 
 
 def make_brighter(project):
-    project.makefile(".xml", ball=SCENE.replace('value="0.5"', 'value="0.6"'))
+    project.makefile(".xml", ball=SCENE.replace('"0.5"', '"0.6"'))
 
 
 def reference(project):
@@ -162,9 +154,9 @@ def test_scenes_of_any_kind_and_wrong_ones(project):
         def scene(albedo):
             film = {"type": "hdrfilm", "width": 8, "height": 8, "rfilter": {"type": "box"}}
             ball = {"type": "sphere", "bsdf": {"type": "diffuse", "reflectance": albedo}}
-            camera = {"type": "perspective", "film": film,
-                      "to_world": mi.ScalarTransform4f().look_at([0, -4, 1], [0, 0, 0], [0, 0, 1])}
-            return {"type": "scene", "i": {"type": "direct"}, "c": camera, "s": ball, "e": {"type": "constant"}}
+            camera = mi.ScalarTransform4f().look_at([0, -4, 1], [0, 0, 0], [0, 0, 1])
+            return {"type": "scene", "i": {"type": "direct"}, "s": ball, "e": {"type": "constant"},
+                    "c": {"type": "perspective", "film": film, "to_world": camera}}
 
         @pytest.fixture
         def check(render_regression):
