@@ -170,9 +170,10 @@ class ShapeDisplacement:
         """Differentiable arrays of the heights and the scale."""
         return [self.scale, *self.heights.variables()]
 
-    def bound(self) -> DisplacementBound:
-        """Scaled heights as a function of the location, and their bound, for adaptive tessellation."""
-        channel, scale = self.channel, self._host_scale
+    def bound(self, to_world: FloatArray) -> DisplacementBound:
+        """Scaled heights in world space as a function of the location, and their bound, for adaptive tessellation."""
+        # The spectral norm is the largest factor by which the linear map scales a length.
+        channel, scale = self.channel, self._host_scale * float(np.linalg.norm(to_world[:3, :3], 2))
         float_type = dr.scalar.ArrayXf64 if self.kernel is None else self.kernel.types.float
 
         def heights_at(start: IntArray, uv: FloatArray) -> FloatArray:

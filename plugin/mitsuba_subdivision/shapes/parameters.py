@@ -66,18 +66,15 @@ class Tessellation:
         surface: LimitSurface,
         control_points: NDArray,  # (n, 3) float64 in object space
         to_world: NDArray,  # (4, 4) float64
-        # In object space. With a displacement, the limit holds everywhere, as silhouettes are unknown.
-        bound: DisplacementBound | None,
+        bound: DisplacementBound | None,  # In world space
     ) -> VertexTable:
         """Prepare the tessellation. A uniform one does not depend on the control points."""
         if self.limit is None:
             return surface.sampling(self.rate)
         criterion = self.criterion
         if bound is not None:
-            # The spectral norm is the largest factor by which the linear map scales a length.
-            stretch, heights = float(np.linalg.norm(to_world[:3, :3], 2)), bound.heights
-            in_world = replace(bound, heights=lambda *at: stretch * heights(*at), extent=stretch * bound.extent)
-            criterion = replace(criterion, outline=None, displacement=in_world)
+            # The limit holds everywhere, as silhouettes are unknown.
+            criterion = replace(criterion, outline=None, displacement=bound)
         world_points = control_points @ to_world[:3, :3].T + to_world[:3, 3]
         with errors_about(self.limit):
             return surface.adaptive_sampling(criterion, self.rate, world_points)

@@ -118,7 +118,7 @@ def make_subdivision(
             self._placement.take(self.to_world, to_world)
             parameters, surface = self._parameters, self._parameters.surface
             is_adaptive = self._tessellation.limit is not None
-            bound = self._displacement.bound() if self._displacement is not None and is_adaptive else None
+            bound = self._displacement.bound(to_world) if self._displacement is not None and is_adaptive else None
             table = self._tessellation.table(surface, control_points, to_world, bound)
             kept = None if parameters.shown is None else np.flatnonzero(parameters.shown[table.element])
             # Displaced vertices are averaged over copies along all seams.
