@@ -320,10 +320,7 @@ def _pictures(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[t
 
 
 def _render_by_passes(options: argparse.Namespace, *, is_model: bool = False) -> None:
-    """Render by passes, in the current variant, here or on a cluster, and write the image.
-
-    Raises RegressionError if there are fewer batches than passes, or no cluster answers.
-    """
+    """Render by passes, in the current variant, here or on a cluster, and write the image."""
     from ..regression import renders
     from ..regression.image import save_image
 

@@ -60,8 +60,7 @@ def patch_of_valence(scheme: Scheme, valence: int) -> IrregularPatch:
 def characteristic_points(patch: IrregularPatch, valence: int) -> FloatArray:
     """Control points ``(K, 2)`` of the characteristic map, from a patch's parameters to the plane.
 
-    The two subdominant eigenvectors could be any basis of their plane. In the basis chosen here, the edges at the
-    extraordinary point form a regular star around (0, 0), and the first edge lies along x.
+    Of all bases of the subdominant eigenvectors, that in which edges at the point (0, 0) are a regular star, from x on.
     """
     points, turn = patch.basis.vectors[:, 1:3], 2 * np.pi / valence
     begin, end = on_patch(patch.scheme, patch.signature, points, patch.scheme.domain.corners[[1, -1]])
@@ -136,10 +135,9 @@ def draw_domains(options: FigureOptions) -> list[Path]:
 
 
 def refinement_step(patch: IrregularPatch, valence: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """A patch with one extraordinary vertex and its four children, in the plane of its characteristic map.
+    """Control points ``(K, 2)`` of a patch and ``(M, 2)`` of its children, and the ends of edges between either.
 
-    Returns control points of the patch ``(K, 2)`` and of its children ``(M, 2)``: the different rows of A and of the
-    matrices of the regular ones; and both ends of the edges between either, ``(.., 2, 2)`` each.
+    They lie where the patch's characteristic map puts them.
     """
     old = characteristic_points(patch, valence)
     stencils = np.unique(np.concatenate([patch.matrix, *patch.children]).round(DECIMALS), axis=0)
@@ -154,11 +152,7 @@ def refinement_step(patch: IrregularPatch, valence: int) -> tuple[FloatArray, Fl
 
 
 def draw_refinement(options: FigureOptions) -> list[Path]:
-    """Draw the control points of a patch of valence 5 before and after one refinement.
-
-    The points lie where the characteristic map puts them. The refined points come from the evaluator's subdivision
-    matrices.
-    """
+    """Draw the control points of a patch of valence 5 before and after one refinement."""
     patch = patch_of_valence(scheme_named("catmull_clark"), VALENCE)
     old, new, old_edges, new_edges = refinement_step(patch, VALENCE)
     image, domain = partial(on_patch, patch.scheme, patch.signature, old), patch.scheme.domain
@@ -288,16 +282,13 @@ def growth(valence: int) -> float:
 
 
 def curvature_map(surface: LimitSurface, valence: int, count: int) -> NDArray[np.floating]:
-    """Sample the elements around vertex 0, more densely towards it.
-
-    Returns x and y in the tangent plane, Gaussian and mean curvature, of a grid in each element, (4, valence, n, n);
-    mean curvature is positive where the surface bends inward, as on a ball.
-    """
+    """Coordinates x and y in the tangent plane, Gaussian and mean curvature around vertex 0, ``(4, valence, n, n)``."""
     # From a thousandth of the element on. The point itself has no curvature, or one of no interest.
     uv = grid_points(np.concatenate([[0], np.geomspace(1e-3, 1, count)]))
     uv[0] = 1e-4
     points, gaussian, mean = _curvatures(surface, uv, valence)
     x, y, _ = (points - surface.evaluate(0, [[0, 0]]).p[0]).T
+    # Positive where the surface bends inward, as on a ball.
     return np.stack([x, y, gaussian, -mean]).reshape(4, valence, count + 1, count + 1)
 
 

@@ -232,10 +232,7 @@ def _fit_mesh(views: list[View]) -> Course:
 
 @timed("Fitting creases")
 def _fit_creases() -> tuple[list[Box], NDArray[np.float64]]:
-    """Fit a box from a cube whose edges all have the same sharpness.
-
-    Returns target, start and result; and the sharpness of all edges after each step, ``(CREASE_STEPS + 1, 12)``.
-    """
+    """Fit a box; returns target, start and result, and the sharpness of edges after each step, ``(steps + 1, 12)``."""
     edges, z = cube().edges, cube().positions[cube().edges, 2]
     truth = np.where(z.min(axis=1) > 0, TOP, np.where(z.max(axis=1) < 0, BOTTOM, UPRIGHT))
     sharpness = [np.full(len(edges), FIRST)]
@@ -263,10 +260,7 @@ def _fit_creases() -> tuple[list[Box], NDArray[np.float64]]:
 
 
 def distances(target: ControlCage, cages: Sequence[ControlCage]) -> NDArray[np.float64]:
-    """Chamfer's distances of surfaces to a target's triangles, in its diagonals: the means of both directions.
-
-    Cages are surfaces, but for those of triangles, which are meshes themselves.
-    """
+    """Chamfer's distances of surfaces, or of cages of triangles as they are, to a target's triangles, in diagonals."""
     points = mesh_samples(target.positions, target.triangles, SAMPLES, 0)[0]
     tree = cKDTree(points)
     measured = []

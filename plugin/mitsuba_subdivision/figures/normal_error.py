@@ -80,11 +80,7 @@ def surface_of(scheme: str, valence: int) -> LimitSurface:
 
 
 def vertex_normal(surface: LimitSurface, evaluator: Evaluator, offset: float) -> tuple[int | None, float, float]:
-    """Sample of float32 at ``u = v = offset`` beside an extraordinary point, against float64 there.
-
-    Returns its level n, None at the point itself; the distance |c1| of the point from the origin; and the error of its
-    normal in degrees.
-    """
+    """Level (None at the point itself), |c1|, and error of the normal in degrees, of float32 at ``u = v = offset``."""
     uv = np.full((1, 2), offset)
     single = surface.evaluate(0, uv, evaluator=evaluator, dtype=np.float32)
     double = surface.evaluate(0, uv)
@@ -94,11 +90,7 @@ def vertex_normal(surface: LimitSurface, evaluator: Evaluator, offset: float) ->
 
 
 def draw_artifact(options: FigureOptions) -> list[Path]:
-    """Render valences 3 and 5 with vertex normals by (11), (12) and (13).
-
-    Only the arithmetic of (11) in float32 darkens the first column: scene, light, tessellation and positions are the
-    same in all columns.
-    """
+    """Render valences 3 and 5 with vertex normals by (11), (12) and (13): columns differ in nothing else."""
     if options.cage:
         rows = _rows_of_user(options.cage, options.scheme)
     else:
@@ -189,10 +181,7 @@ MARKED = 10
 
 
 def draw_error(options: FigureOptions) -> list[Path]:
-    """Plot the angle between computed and exact normals at every level.
-
-    The exact normals come from powers of the subdivision matrix in 60-digit arithmetic.
-    """
+    """Plot the angle between computed and exact normals at every level."""
     cages = {valence: extraordinary(valence) for valence in VALENCES}
     if options.cage:
         cages = around_vertices(options.cage, len(VALENCES), frame(LimitSurface(extraordinary(5))))
@@ -224,14 +213,12 @@ def _draw_panel(axis: Axes, cage: ControlCage) -> None:
 
 
 def offset_cage(cage: ControlCage, offset: float) -> ControlCage:
-    """A cage, moved so that the limit point of vertex 0 has this distance from the origin.
-
-    Its coordinates are rounded to float32, so that every evaluator gets the same numbers.
-    """
+    """A cage, moved so that the limit point of vertex 0 has this distance from the origin."""
     limit = LimitSurface(cage).evaluate(0, [[0.0, 0.0]]).p[0]
     # A direction that favours no axis, and is neither normal nor tangent to the surface.
     direction = np.array([0.48, 0.6, 0.64])
     moved = cage.positions - limit + offset * direction
+    # Every evaluator gets the same numbers.
     return cage.with_positions(moved.astype(np.float32).astype(np.float64))
 
 
@@ -305,15 +292,7 @@ def on_stage(surface: LimitSurface, points: NDArray[np.floating], magnification:
 
 
 def draw_zoom(options: FigureOptions) -> list[Path]:
-    """Draw the neighbourhood of a vertex of valence 5 at four magnifications, with normals by (11) and by (12).
-
-    The left half of each panel is rendered. In the right half, colour shows the angle between the normals and the exact
-    normals: most of these angles are too small for a visible change of shade.
-
-    The surface is sampled anew for every panel. Its normals are evaluated in float32. The positions of the samples come
-    from float64: this far from the origin, float32 cannot tell the points of the last panels apart. OpenSubdiv's
-    normals come from its patch tables (Far), where its program is found.
-    """
+    """Draw a vertex of valence 5 at four magnifications: rendered, and the errors of normals, too small for shades."""
     surface = LimitSurface(offset_cage(extraordinary(ZOOM_VALENCE), ZOOM_OFFSET))
     stage, resolution = load_stage("zoom", resolution=options.resolution), options.resolution
     sensor, count = stage.sensors()[0], max(resolution // 2, 8)
@@ -360,10 +339,10 @@ def parameter_extent(magnification: float) -> float:
 
 
 def panel_samples(surface: LimitSurface, magnification: float, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sample a grid of ``count`` segments along each side in every element at the point, as far as a panel shows.
+    """Samples of a grid of ``count`` segments along each side, in every element at the point as far as a panel shows.
 
-    Returns parameters ``(s, 2)``, the same in each element; and positions on the stage and normals of exact arithmetic,
-    ``(valence, s, 3)`` each.
+    Returns parameters ``(s, 2)``; positions on the stage and normals, in float64, ``(valence, s, 3)`` each: this far
+    from the origin, float32 cannot tell the points of the last panels apart.
     """
     uv = grid_points(np.linspace(0, 1, count + 1))
     # Stam's form has no value at the point itself.
@@ -382,11 +361,7 @@ def normals_by(
     exact: FloatArray,
     method: Method,
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Normals by one of our evaluators or by OpenSubdiv, both in float32, ``(valence, s, 3)``.
-
-    Returns besides their angles to the exact normals in degrees ``(valence, s)``, and the median of those inside the
-    image.
-    """
+    """Normals in float32, their angles to the exact ones in degrees, and the median of those inside the image."""
     elements = np.arange(ZOOM_VALENCE)[:, None]
     if method == "opensubdiv":
         program = osd_peer()

@@ -53,10 +53,9 @@ def osd_samples(
     # approximation
     level: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Evaluate OpenSubdiv's Catmull-Clark surface in float32, its usual precision.
+    """Points and unit normals ``(s, 3)`` of OpenSubdiv's Catmull-Clark surface in float32, its usual precision.
 
-    Raises FigureError if the program fails.
-    Returns points, normals, (s, 3): unit normals, not a number where derivatives are parallel or vanish.
+    Normals are not a number where derivatives are parallel or vanish.
     """
     element, u, v = np.broadcast_arrays(element, np.asarray(uv)[..., 0], np.asarray(uv)[..., 1])
     records: dict[str, NDArray] = {
@@ -81,11 +80,7 @@ def blender_mesh(
     cage: ControlCage,  # Without tags; Catmull-Clark's
     level: int,  # Edges of quads become `2 ** level` segments
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32], str]:
-    """Subdivide a cage in Blender, by default options but for the level. Raises FigureError if Blender fails.
-
-    Returns points of the limit surface and normals for smooth shading, in float32, of vertices ``(n, 3)``; the vertices
-    of each face ``(m, 4)``; and Blender's version, two numbers.
-    """
+    """Points and shading normals ``(n, 3)`` of Blender's modifier, its faces ``(m, 4)``, and Blender's version."""
     # Several threads race for the last bits of points that faces share.
     options = ["--threads", "1", "--background", "--factory-startup", "--python-exit-code", "1"]
     options += ["--python", str(BLENDER_SCRIPT), "--"]

@@ -102,10 +102,7 @@ def draw_displacement(options: FigureOptions) -> list[Path]:
 
 
 def quilt() -> NDArray[np.float32]:
-    """Heights of cushions between grooves that cross, with a bead at each crossing, ``(ROWS, COLUMNS)``, up to 1.
-
-    The image repeats around the jar.
-    """
+    """Heights, up to 1, of cushions between grooves with a bead at each crossing: an image that repeats sideways."""
     x, y = np.meshgrid((np.arange(COLUMNS) + 0.5) / COLUMNS, (np.arange(ROWS) + 0.5) / ROWS)
     part = (y - LOWEST) / (HIGHEST - LOWEST)
     # Grooves lie where either of these is an integer.

@@ -37,11 +37,8 @@ SMALLEST = 1e-300
 
 
 def load_stage(name: str, **parameters: str | float) -> mi.Scene:
-    """Load a scene of the figures, with values for some of its parameters.
-
-    Its reconstruction filter becomes the box filter: with others, the order of sums, and so the last bits, vary from
-    run to run.
-    """
+    """Load a scene of the figures, with values for some of its parameters."""
+    # With other filters than the box, the order of sums, and so the last bits, vary from run to run.
     return load_scene(example_file(f"{name}.xml"), parameters, "box").scene
 
 
@@ -73,10 +70,7 @@ def staged(stage: mi.Scene, shapes: Sequence[mi.Shape] | None = None, **objects:
 
 
 def render(scene: mi.Scene, options: FigureOptions, name: str) -> NDArray[np.float32]:
-    """Render with the samples per pixel of the options: ``(height, width, channels)``, linear.
-
-    Every part has a seed of its own, so that the same options give the same image.
-    """
+    """Render with the samples per pixel of the options: ``(height, width, channels)``, linear."""
     width, height = scene.sensors()[0].film().crop_size()
     return render_parts(scene, _parts(options.spp, PART_SAMPLES // (int(width) * int(height))), what=name)
 
@@ -227,11 +221,9 @@ def around_vertices(
     most: int,  # Number of vertices
     like: tuple[NDArray[np.float64], ...],  # (3,), (3, 3), (): as `frame` returns it
 ) -> dict[int, ControlCage]:
-    """Cages around extraordinary vertices of a cage, one of each of the lowest valences, by their valences.
+    """A cage, moved, turned and scaled, with each of its extraordinary vertices of the lowest valences at a frame.
 
-    Vertex 0 of each is extraordinary, the first faces lie around it, and each of them begins with it. The cage is
-    moved, turned and scaled so that `frame` of the vertex becomes another one.
-    Raises FigureError if the cage has no extraordinary vertex inside of its surface whose faces have no creases.
+    That is vertex 0, the first faces lie around it, and each of them begins with it. Valences are the keys.
     """
     cage = read(path)
     fans = _isolated_fans(cage)

@@ -62,13 +62,7 @@ RING = "#0a84c6"
 
 
 def draw_zebra(options: FigureOptions) -> list[Path]:
-    """Render a mirror in the shape of a cube's limit surface amid stripes, with the normals of several methods.
-
-    These are the exact normals; a mesh of level 3 with averaged normals; and, where their programs are found,
-    OpenSubdiv's surface with its own normals and the mesh of Blender's modifier, both as fine as the exact surface. The
-    row below shows the angles between their normals and the exact ones. With a user's cage, an extraordinary vertex of
-    it is where the cube's corner is.
-    """
+    """Render mirrors amid stripes with the normals of several methods, and their angles to the exact ones below."""
     stage = load_stage("zebra", resolution=options.resolution, fov=FIELD_OF_VIEW)
     surface, level, at = LimitSurface(cube()), FINE_LEVEL, (CORNER_FACE, CORNER)
     if options.cage:

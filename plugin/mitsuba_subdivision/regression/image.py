@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
 import os
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -346,20 +345,13 @@ def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
     return channels, metadata
 
 
-@contextlib.contextmanager
+@contextmanager
 def _quiet() -> Iterator[None]:
     """Close standard output and error while OpenEXR reads: of a damaged file, it writes a line for each row."""
-    with _quieting, contextlib.ExitStack() as stack:
-        stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
-        try:
+    with _quieting, open(os.devnull, "w") as nothing, redirect_stdout(nothing), ExitStack() as stack:
+        with suppress(OSError):  # Where standard error is closed
             kept = os.dup(2)
-        except OSError:
-            # Standard error is closed.
-            yield
-            return
-        stack.callback(os.close, kept)
-        null_device = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null_device, 2)
-        os.close(null_device)
-        stack.callback(os.dup2, kept, 2)
+            stack.callback(os.close, kept)
+            stack.callback(os.dup2, kept, 2)
+            os.dup2(nothing.fileno(), 2)
         yield

@@ -60,10 +60,7 @@ class Sampling:
         return self.batches * self.batch
 
     def share(self, number: int, count: int) -> range:
-        """Batches of pass ``number`` of ``count``, where passes count from 1.
-
-        Raises RegressionError if there is no such pass, or more passes than batches.
-        """
+        """Batches of pass ``number`` of ``count``, where passes count from 1."""
         if not 1 <= number <= count:
             raise RegressionError(f"there is no pass {number} of {count}; expected 1 to {count}")
         if count > self.batches:
@@ -116,10 +113,7 @@ def render_pass(
 
 
 def merge_passes(passes: Sequence[Image], name: str = "merged") -> Image:
-    """Merge passes of one image. The order in which they are given makes no difference.
-
-    Raises RegressionError if a file is no pass, passes are of different images, or two have the same samples.
-    """
+    """Merge passes of one image. The order in which they are given makes no difference."""
     if not passes:
         raise RegressionError("no passes to merge; expected at least one")
     for image in passes:
@@ -221,10 +215,7 @@ _lock = threading.Lock()
 
 @contextmanager
 def cluster(address: str) -> Iterator[Client]:
-    """The cluster of a scheduler, at an address such as "tcp://farm:8786".
-
-    Raises RegressionError if `distributed` is not installed, or the cluster is not there.
-    """
+    """The cluster of a scheduler, at an address such as "tcp://farm:8786"."""
     try:
         from distributed import Client
     except ImportError:
@@ -240,10 +231,9 @@ def cluster(address: str) -> Iterator[Client]:
 
 
 def results(client: Client, work: Callable[[int], T], variant: str, numbers: Sequence[int]) -> Iterator[tuple[int, T]]:
-    """Numbers and what the workers of a cluster make of them, in the order in which they finish.
+    """Numbers and what the workers of a cluster make of them by picklable work, in the order in which they finish.
 
-    Where a worker ends early, another one repeats its work, one call at a time in each, in a variant of Mitsuba. The
-    work must be picklable.
+    Where a worker ends early, another one repeats its work.
     """
     from distributed import as_completed
 
@@ -261,18 +251,17 @@ def _work(work: Callable[[int], T], variant: str, number: int) -> tuple[int, T]:
 
 def render_on_cluster(
     address: str,
-    load: Callable[[], LoadedScene],
+    load: Callable[[], LoadedScene],  # Picklable
     variant: str,
     sampling: Sampling,
-    count: int,
+    count: int,  # 0 for the number of threads
     *,
     with_probe: bool = False,
 ) -> Image:
-    """Render the passes of an image on the workers of a cluster, and merge them.
+    """Render the passes of an image on the workers of a cluster, or as many as these have threads, and merge them.
 
     With the box filter and an LLVM variant, the image has the same bits as the same passes on one machine, if the
-    workers have that machine's versions and processor. Each loads the scene by ``load``, which must be picklable. A
-    ``count`` of 0 makes as many passes as the workers have threads.
+    workers have that machine's versions and processor.
     """
     with cluster(address) as client, timed("Rendering on the cluster"):
         count = count or min(sum(client.nthreads().values()), sampling.batches)
@@ -299,10 +288,7 @@ def as_reference(
     path: str | Path,  # Of the reference, in whose folder the command runs
     tolerances: Tolerances,
 ) -> Image:
-    """Make a reference of an image: its metadata get tolerances, and the command that makes it.
-
-    `save_image` writes the file. Raises RegressionError if the image is not finite.
-    """
+    """Make a reference of a finite image: its metadata get tolerances, and the command that makes it."""
     require_finite(image)
     limits, made_by = tolerances.as_dict(), image.metadata
     metadata, sampling = {**made_by, "tolerances": limits}, made_by["sampling"]
@@ -358,13 +344,9 @@ def variant_for(reference: Image) -> str:
 def render_like(
     reference: Image, source: SceneSource, spp: int = TEST_SPP, seed: int = 0, *, second_attempt: bool = False
 ) -> Image:
-    """Render a scene in the current variant with the settings of a reference.
+    """Render a scene in the current variant with the settings of a reference, and with other samples for each seed.
 
-    The samples are independent of the reference's. The first attempt also has the geometry probe, and repeats the first
-    batch of the reference sample by sample, for the paired tier.
-    Each ``seed`` from 0 on has other samples, as has the second attempt with each.
-
-    Raises UnusableReference if the reference does not say how it was rendered, or has another size.
+    The first attempt also has the probe, and for the paired tier the samples of the reference's first batch.
     """
     sampling = sampling_of(reference)
     loaded = load_scene(source, reference.metadata.get("parameters"), reference.metadata.get("filter"))
@@ -389,13 +371,10 @@ def compare_scene(
     suite_size: int = 1,
     seed: int = 0,
 ) -> Comparison:
-    """Render a scene as its reference was, in the current variant, and compare the two.
+    """Render a scene as its reference was, in the current variant, and `compare` the two.
 
     Where only the tile tier fails, chance may be the reason. A second attempt with new samples, four times as many,
     then decides.
-
-    Tiers, tolerances and suite size are as in `compare`, the seed as in `render_like`. The samples are rounded up to
-    whole batches, of the reference's size or less.
     """
     test = render_like(reference, source, spp, seed)
     comparison = compare(reference, test, tiers, tolerances, suite_size)

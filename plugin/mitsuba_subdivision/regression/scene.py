@@ -72,11 +72,7 @@ def load_scene(
     filter_name: str | None = None,
     sensor_index: int = 0,  # Which of the scene's sensors renders, from 0 on
 ) -> LoadedScene:
-    """Load a scene in the current variant.
-
-    Raises RegressionError if there is no such file or sensor, or the filter of a scene that is already loaded is
-    another.
-    """
+    """Load a scene in the current variant."""
     given = {name: str(value) for name, value in (parameters or {}).items()}
     source = Path(source) if isinstance(source, str) else source
     path = source if isinstance(source, Path) else None
@@ -182,10 +178,7 @@ def _checksums(path: Path, state: mi.parser.ParserState) -> dict[str, str]:
 
 
 def render_pixels(scene: mi.Scene, seed: int, spp: int, **options: Any) -> NDArray[np.float32]:
-    """Render a scene in the current variant with all channels of its film: ``(height, width, channels)``.
-
-    The other options are those of `mi.render`.
-    """
+    """Render a scene with all channels of its film, ``(height, width, channels)``, and options of `mi.render`."""
     return np.array(mi.render(scene, seed=seed, spp=spp, **options))  # type: ignore[arg-type] # a seed may be an int
 
 
@@ -194,8 +187,7 @@ def render_parts(
 ) -> NDArray[np.float32]:
     """Mean of parts of an image, given by their samples per pixel, each weighted by these.
 
-    Part i of n has the seed ``seed * n + i``, so that images of several seeds share no samples. A line on the terminal
-    says ``what`` is done. The other options are those of `mi.render`.
+    Part i of n has the seed ``seed * n + i``, so that images of several seeds share no samples.
     """
     total: NDArray[np.float64] | float = 0.0
     with timed(what) as at:
@@ -207,11 +199,7 @@ def render_parts(
 
 
 def render_image(loaded: LoadedScene, spp: int, seed: int = 0) -> NDArray[np.float32]:
-    """Render a scene in the current variant with all channels of its film: ``(height, width, channels)``.
-
-    Where the sampler is "independent", an image of many samples is rendered in parts, as these do not depend on each
-    other. Any other image is one call of `mi.render`.
-    """
+    """Render with all channels: many samples in parts, where the sampler is "independent"; else by one `mi.render`."""
     is_independent = str(loaded.sensor.sampler()).startswith("IndependentSampler")
     parts = parts_of(spp, loaded.size) if is_independent else [spp]
     if len(parts) > 1:
@@ -231,10 +219,8 @@ _NUMBERS = ("cpu family", "model", "CPU implementer", "CPU architecture", "CPU v
 
 
 def environment(variant: str) -> dict[str, str]:
-    """Versions of libraries, and the processor, that renders in a variant depend on.
-
-    The version of this package is left out: its changes are what the tests are for.
-    """
+    """Versions of libraries, and the processor, that renders in a variant depend on."""
+    # Not of this package: its changes are what the tests are for.
     modules = {"mitsuba": mi, "drjit": dr, "numpy": np, "scipy": scipy}
     versions = {name: module.__version__ for name, module in modules.items()} | {"processor": _processor()}
     if variant.startswith("llvm"):
@@ -250,10 +236,7 @@ def _processor() -> str:
 
 
 def _first_of(information: str) -> str:
-    """The first processor of Linux's list, by its name and numbers.
-
-    The name is not enough: virtual machines call processors of several generations "AMD EPYC".
-    """
+    """The first processor of Linux's list, by its name and numbers: generations share names such as "AMD EPYC"."""
     lines = [line.split(":", 1) for line in information.split("\n\n", 1)[0].splitlines() if ":" in line]
     values = {name.strip(): value.strip() for name, value in lines}
     names = ["model name", *_NUMBERS]

@@ -43,9 +43,8 @@ MISSED_EVENTS = 3.0
 # Below it, the deviance is that of the normal distribution to one part in 10^5.
 _SMALL_EXCESS = 1e-5
 
-# ACES tone curve (a x^2 + b x + c) / (d x^2 + e x + f), as in FLIP, and the value that limits its exposures.
-_ACES = (0.6 * 0.6 * 2.51, 0.6 * 0.03, 0.0, 0.6 * 0.6 * 2.43, 0.6 * 0.59, 0.14)
-_ACES_LIMIT = 0.85
+# What FLIP's tone curve, ACES, maps to 0.85, the value that limits its exposures; and weights of R, G and B.
+_BRIGHT = 2.118872324
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
 # Stops between the brightest and the median pixel at most: more would take time and show nothing new.
 _MOST_STOPS = 12
@@ -399,15 +398,12 @@ def flip_exposures(pixels: NDArray[np.floating]) -> tuple[float, float, int]:
     FLIP would end the whole process at a black image. As in FLIP, the first and the last exposure map the brightest and
     the median luminance to 0.85 of the tone curve.
     """
-    a, b, c, d, e, f = _ACES
-    t = _ACES_LIMIT
-    bright = max(np.roots([a - t * d, b - t * e, c - t * f]).real)
     luminance = np.maximum(pixels, 0) @ _LUMINANCE
     brightest = float(luminance.max())
     if not brightest > 0:
         return 0.0, 1.0, 2
     median = max(float(np.median(luminance)), brightest * 2.0**-_MOST_STOPS)
-    start, stop = float(np.log2(bright / brightest)), float(np.log2(bright / median))
+    start, stop = float(np.log2(_BRIGHT / brightest)), float(np.log2(_BRIGHT / median))
     stop = max(stop, start + 1)
     return round(start, 3), round(stop, 3), max(2, int(np.ceil(stop - start)))
 
