@@ -35,11 +35,9 @@ _DEEPEST = 24
 _ROULETTE = 3
 
 
-def bsdf(
-    material: MaterialContents | None, shape: ShapeContents, textures: Textures, notes: StageWarnings
-) -> SceneNode:
-    """BSDF of a material, which may read attributes of the shape; without one, its display colour and opacity."""
-    return _Surface(material, shape, textures, notes).bsdf()
+def bsdf(shape: ShapeContents, textures: Textures, notes: StageWarnings) -> SceneNode:
+    """BSDF of a shape's material, which may read its attributes; without one, its display colour and opacity."""
+    return _Surface(shape, textures, notes).bsdf()
 
 
 def radiance(material: MaterialContents, textures: Textures, notes: StageWarnings) -> SceneNode | None:
@@ -92,13 +90,12 @@ def integrator(
 
 
 class _Surface:
-    """Assembles the BSDF of a shape with a material; its inputs as Mitsuba's textures and numbers."""
+    """Assembles the BSDF of a shape; inputs of its material as Mitsuba's textures and numbers."""
 
-    def __init__(
-        self, material: MaterialContents | None, shape: ShapeContents, textures: Textures, notes: StageWarnings
-    ) -> None:
-        self._material, self._shape, self._textures, self._notes = material, shape, textures, notes
-        given = {} if material is None else {name: self._for_shape(value) for name, value in material.inputs.items()}
+    def __init__(self, shape: ShapeContents, textures: Textures, notes: StageWarnings) -> None:
+        self._material, self._shape, self._textures, self._notes = shape.material, shape, textures, notes
+        inputs = {} if shape.material is None else shape.material.inputs
+        given = {name: self._for_shape(value) for name, value in inputs.items()}
         self._inputs: dict[str, Input] = {**NEUTRAL, **given}
         self._inputs |= {name: _clamped(self._inputs[name]) for name in _FRACTIONS}
 

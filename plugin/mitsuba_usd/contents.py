@@ -6,7 +6,8 @@ Matrices are ``(4, 4)`` float64 for column vectors. Colours are linear, with the
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from mitsuba_subdivision.cage import CageContents
@@ -53,6 +54,7 @@ class NodeContents:
     inputs: dict[str, Input]
 
 
+Part = TypeVar("Part", "ShapeContents", "LightContents")
 Source = TextureContents | PrimvarContents | NodeContents
 # A number or a colour, or where it comes from.
 Input = float | list[float] | str | Source
@@ -118,7 +120,7 @@ class ShapeContents:
     cage: CageContents  # In the prim's own space. Without a scheme, it is a polygon mesh.
     to_world: NDArray  # (4, 4) float64: to the world, or to the space of the group that the shape belongs to
     normals: NDArray | None = None  # (n_h, 3) float64: of a polygon mesh, at its face corners; None for facets
-    material: int | None = None  # Index of a material
+    material: MaterialContents | None = None  # Those that are equal are one
     constants: dict[str, list[float]] = field(default_factory=dict)  # Attributes with one value for the whole mesh
     radiance: list[float] | None = None  # Three numbers, if the mesh is a light
     # (n,) int: faces with this material, of a limit surface that is evaluated whole; None for all. Parts of polygon
@@ -133,6 +135,10 @@ class InstanceContents:
     name: str
     group: int
     to_world: NDArray
+
+    def placed(self, part: Part) -> Part:
+        """A part of the group where the instance is."""
+        return replace(part, name=f"{self.name}{part.name}", to_world=self.to_world @ part.to_world)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +186,6 @@ class SceneContents:
     shapes: list[ShapeContents] = field(default_factory=list)
     groups: list[list[ShapeContents]] = field(default_factory=list)
     instances: list[InstanceContents] = field(default_factory=list)
-    materials: list[MaterialContents] = field(default_factory=list)
     lights: list[LightContents] = field(default_factory=list)
     camera: CameraContents | None = None
     resolution: list[int] | None = None
@@ -189,6 +194,11 @@ class SceneContents:
     def all_shapes(self) -> list[ShapeContents]:
         """Shapes of the stage and of its groups."""
         return [*self.shapes, *(shape for group in self.groups for shape in group)]
+
+    @property
+    def materials(self) -> list[MaterialContents]:
+        """Materials of the shapes, each once."""
+        return list(dict.fromkeys(shape.material for shape in self.all_shapes if shape.material is not None))
 
     @property
     def placed_shapes(self) -> list[tuple[ShapeContents, NDArray[np.float64]]]:

@@ -40,7 +40,7 @@ def with_large_copies(contents: SceneContents) -> SceneContents:
     sizes = [[len(shape.cage.face_sizes) for shape in group] for group in contents.groups]
     is_large = [bool(group) and sum(group) >= LARGE * len(group) for group in sizes]
     copies = [
-        replace(shape, name=f"{instance.name}{shape.name}", to_world=instance.to_world @ shape.to_world)
+        instance.placed(shape)
         for instance in contents.instances
         if is_large[instance.group]
         for shape in contents.groups[instance.group]

@@ -106,7 +106,7 @@ def texels_for_pictures(contents: SceneContents, sensors: Sequence[SceneNode]) -
     needed: dict[str, float] = {}
     for shape, copies in matrices.items():
         texels = TEXELS_PER_PIXEL * _pixels_of_texcoords(shape.cage, np.stack(copies), seen)
-        inputs = contents.materials[shape.material or 0].inputs.values()
+        inputs = shape.material.inputs.values() if shape.material else ()
         # Where pictures are read at computed coordinates, the detail is unknown.
         known = [given for given in inputs if not (isinstance(given, NodeContents) and samples_elsewhere(given))]
         for texture in (leaf for given in known for leaf in leaves(given)):

@@ -48,29 +48,25 @@ from .textures import Textures
 # faces around is smaller than its cage by a six-hundredth of its radius.
 DENSE = 2_000
 _NO_POINTS: NDArray[np.float64] = np.zeros((0, 3))
-# Fields of a shape that may differ between frames that share an object: a shape can move, and materials are compared
-# themselves.
-_MOVABLE = frozenset({"cage", "to_world", "material"})
-Loaded = tuple[ShapeContents, MaterialContents | None, mi.Object]
+# Fields of a shape that may differ between frames that share an object.
+_MOVABLE = frozenset({"cage", "to_world"})
 
 
 def scene_entries(
     contents: SceneContents,
+    rest: SceneNode,  # Entries of the integrator, the sensor and a studio; none where nothing can be seen
     notes: StageWarnings,
     parameters: dict[str, Any],  # Of every shape `subdivision`; see `with_rate`
     surfaces: Surfaces,  # Provides the limit surfaces
     textures: Textures,
     # Parameters of some limit surfaces, in place of those of all
     chosen: Mapping[ShapeContents, dict[str, Any]] | None = None,
-    *,
     loaded: LoadedShapes | None = None,  # If given, its objects are used as shapes
-    # Whether shapes of lights let light through, which takes the integrator `volpath`
-    has_clear_lamps: bool = False,
 ) -> SceneNode:
-    """Scene entries of a stage, without those of a studio; polygon meshes are those of `PolygonMesh`."""
+    """Scene entries of a stage and the rest; polygon meshes are those of `PolygonMesh`."""
     scene: SceneNode = {"type": "scene"}
     # Keys of BSDFs that are the same for all shapes, by material.
-    shared: dict[int, str] = {}
+    shared: dict[MaterialContents, str] = {}
 
     def add(name: str, entry: Any) -> str:
         """Add an entry with the name of a prim, and return its key."""
@@ -82,42 +78,39 @@ def scene_entries(
         scene[key] = entry
         return key
 
-    def made(shape: ShapeContents, material: MaterialContents | None, area: SceneNode | None) -> SceneNode | mi.Object:
-        of_shape = (chosen or {}).get(shape, parameters)
+    def made(shape: ShapeContents, area: SceneNode | None) -> SceneNode | mi.Object:
+        material, of_shape = shape.material, (chosen or {}).get(shape, parameters)
 
         def entry(with_bsdf: SceneNode) -> SceneNode:
             if shape.cage.scheme is None:
                 return {**polygon_mesh(shape).entry(with_bsdf, area), **interior(material)}
             return subdivision(shape, surfaces, with_bsdf, area, {**of_shape, **interior(material)}, notes)
 
-        make = partial(bsdf, material, shape, textures, notes)
+        make = partial(bsdf, shape, textures, notes)
         if loaded is not None:
-            return loaded.object_of(shape, material, entry, make)
-        number = shape.material
-        if material is None or number is None or material.primvars():
+            return loaded.object_of(shape, entry, make)
+        if material is None or material.primvars():
             return entry(make())
-        if number not in shared:
-            shared[number] = add(material.name, make())
-        return entry({"type": "ref", "id": shared[number]})
+        if material not in shared:
+            shared[material] = add(material.name, make())
+        return entry({"type": "ref", "id": shared[material]})
 
     def shown(shape: ShapeContents) -> SceneNode | mi.Object | None:
         """A shape; None if it cannot be used, with a warning."""
-        material = None if shape.material is None else contents.materials[shape.material]
         shining = None if shape.radiance is None else rgb(shape.radiance)
-        if shining is None and material is not None:
-            shining = radiance(material, textures, notes)
+        if shining is None and shape.material is not None:
+            shining = radiance(shape.material, textures, notes)
         area = None if shining is None else {"type": "area", "radiance": shining}
         try:
-            return made(shape, material, area)
+            return made(shape, area)
         except SchemeError as error:
             notes.add_message(f"{error}; the mesh is shown as polygons", shape.name)
-            return made(as_polygons(shape), material, area)
+            return made(as_polygons(shape), area)
         except CageError as error:
             notes.add_message(f"{error}; the prim is left out", shape.name)
             return None
 
-    used = dict.fromkeys(shape.material for shape in contents.all_shapes if shape.material is not None)
-    textures.read(texture for number in used for texture in contents.materials[number].textures())
+    textures.read(texture for material in contents.materials for texture in material.textures())
     for shape in counted(contents.shapes, "Shapes"):
         if (entry := shown(shape)) is not None:
             add(shape.name, entry)
@@ -130,11 +123,13 @@ def scene_entries(
             place = mi.ScalarTransform4f(instance.to_world.tolist())
             group_of = {"type": "ref", "id": groups[instance.group]}
             add(instance.name, {"type": "instance", "group": group_of, "to_world": place})
+    # With it, and with a dome, lights are found behind shapes of other lights that are clear.
+    has_dome = any(light.kind == "dome" for light in contents.lights)
+    are_clear = has_dome or (bool(rest) and rest["integrator"]["type"] == "volpath")
     for light in one_environment(contents.lights, notes):
         entry = emitter(light, textures)
-        is_clear = has_clear_lamps and "emitter" in entry
-        add(light.name, {**entry, "bsdf": {"type": "null"}} if is_clear else entry)
-    return scene
+        add(light.name, {**entry, "bsdf": {"type": "null"}} if are_clear and "emitter" in entry else entry)
+    return {**scene, **rest}
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +167,7 @@ class Surfaces:
     def __init__(self) -> None:
         self._known: dict[tuple[int, ...], list[CachedSurface]] = {}
         # Of shapes whose control points may be others at other times.
-        self._of_shape: dict[tuple[str, int | None], CachedSurface] = {}
+        self._of_shape: dict[tuple[str, str | None], CachedSurface] = {}
 
     def of(self, contents: CageContents) -> CachedSurface:
         """The surface of a cage, without warnings. Raises CageError, or SchemeError if the scheme is the reason."""
@@ -202,7 +197,7 @@ class Surfaces:
         return np.asarray(points[np.isfinite(points).all(axis=1)])
 
     def _points_of(self, shape: ShapeContents) -> NDArray[np.float64]:
-        cage, key = shape.cage, (shape.name, shape.material)
+        cage, key = shape.cage, (shape.name, shape.material.name if shape.material else None)
         if cage.scheme is None:
             return points_at(cage.positions, shape.to_world)
         known = self._of_shape.get(key)
@@ -297,21 +292,20 @@ class LoadedShapes:
     """
 
     def __init__(self) -> None:
-        self._before: dict[tuple[str, int], Loaded] = {}
-        self._now: dict[tuple[str, int], Loaded] = {}
+        self._before: dict[tuple[str, int], tuple[ShapeContents, mi.Object]] = {}
+        self._now: dict[tuple[str, int], tuple[ShapeContents, mi.Object]] = {}
         self._counts: Counter[str] = Counter()
         self._bsdfs: list[tuple[MaterialContents, mi.BSDF]] = []
 
     def begin_frame(self) -> None:
         """Begin the next frame, and free objects that the last one did not use."""
         self._before, self._now, self._counts = self._now, {}, Counter()
-        materials = [material for _, material, _ in self._before.values()]
-        self._bsdfs = [pair for pair in self._bsdfs if any(pair[0] is material for material in materials)]
+        materials = {shape.material for shape, _ in self._before.values()}
+        self._bsdfs = [pair for pair in self._bsdfs if pair[0] in materials]
 
     def object_of(
         self,
         shape: ShapeContents,
-        material: MaterialContents | None,
         entry: Callable[[SceneNode], SceneNode],  # Makes the entry of the shape with a BSDF
         bsdf: Callable[[], SceneNode],  # Makes the entry of its BSDF
     ) -> mi.Object:
@@ -327,20 +321,20 @@ class LoadedShapes:
         )
         if (
             known is None
-            or not (same(known[0], shape, _MOVABLE) and same(known[1], material))
+            or not same(known[0], shape, _MOVABLE)
             or not same_topology(known[0].cage, shape.cage)
             or (shape.cage.scheme is None and not is_there)
         ):
-            known = shape, material, self._loaded(material, entry, bsdf)
+            known = shape, self._loaded(shape.material, entry, bsdf)
         elif not is_there:
             positions = np.asarray(shape.cage.positions, dtype=np.float64)
             if not np.isfinite(positions).all():
                 raise CageError(f"{shape.cage.source.name}: points are not finite; expected finite numbers")
             to_world = mi.ScalarTransform4f(shape.to_world.tolist())
-            set_parameters(known[2], {"control_points": positions, "to_world": to_world})
-            known = shape, known[1], known[2]
+            set_parameters(known[1], {"control_points": positions, "to_world": to_world})
+            known = replace(shape, material=known[0].material), known[1]
         self._now[key] = known
-        return known[2]
+        return known[1]
 
     def _loaded(
         self,

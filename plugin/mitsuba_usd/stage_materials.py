@@ -83,36 +83,33 @@ class MaterialReader:
 
     def __init__(self, time: Usd.TimeCode, notes: StageWarnings) -> None:
         self._time, self._notes = time, notes
-        self._numbers: dict[str, int | None] = {}
-        self.materials: list[MaterialContents] = []  # Of those that are equal, the first
+        self._materials: dict[str, MaterialContents | None] = {}
         # Outputs of shaders, by path and name, and numbers of nodes by the identity of the expression.
         self._known: dict[tuple[str, str], Input | None] = {}
         self._sizes: dict[int, int] = {}
 
-    def bound(self, prim: Usd.Prim) -> int | None:
-        """Number of the material bound to a prim; None if there is none or it is not supported."""
+    def bound(self, prim: Usd.Prim) -> MaterialContents | None:
+        """The material bound to a prim; None if there is none or it is not supported."""
         for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
             material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)[0]
-            number = self.number(material) if material else None
-            if number is not None:
-                return number
+            contents = self._material(material) if material else None
+            if contents is not None:
+                return contents
         return None
 
-    def number(self, material: UsdShade.Material) -> int | None:
-        """Number of a material; None if it is not supported. Materials that differ by their names only have one."""
+    def _material(self, material: UsdShade.Material) -> MaterialContents | None:
+        """A material; None if it is not supported. Of those that differ by their names only, it is the first."""
         path = str(material.GetPath())
-        if path not in self._numbers:
+        if path not in self._materials:
             try:
                 contents = self._contents(material)
             except (AttributeError, TypeError, ValueError, IndexError, RecursionError):
                 what = "materials whose inputs have other types than their model's are ignored"
                 self._notes.add(f"{what}, and display colours are used", path)
                 contents = None
-            alike = (n for n, other in enumerate(self.materials) if same(other, contents, frozenset({"name"})))
-            self._numbers[path] = None if contents is None else next(alike, len(self.materials))
-            if contents is not None and self._numbers[path] == len(self.materials):
-                self.materials.append(contents)
-        return self._numbers[path]
+            alike = (other for other in self._materials.values() if same(other, contents, frozenset({"name"})))
+            self._materials[path] = next(alike, contents)
+        return self._materials[path]
 
     def _contents(self, material: UsdShade.Material) -> MaterialContents | None:
         path = material.GetPath()

@@ -14,7 +14,7 @@ from mitsuba_subdivision.mesh import IntArray
 from numpy.typing import NDArray
 from pxr import Usd, UsdGeom, UsdLux, UsdShade
 
-from .contents import ShapeContents
+from .contents import MaterialContents, ShapeContents
 from .stage_lights_and_camera import read_emission
 from .stage_materials import MaterialReader
 from .stage_warnings import StageWarnings
@@ -91,7 +91,9 @@ class ShapeReader:
             what = "velocities of meshes are ignored; their points are interpolated between samples"
             self._notes.add(what, mesh.GetPath())
 
-    def _materials_of_faces(self, mesh: UsdGeom.Mesh, reader: MeshReader) -> tuple[list[int | None], IntArray]:
+    def _materials_of_faces(
+        self, mesh: UsdGeom.Mesh, reader: MeshReader
+    ) -> tuple[list[MaterialContents | None], IntArray]:
         """Materials of a mesh, and for each face the index of its own among them."""
         prim = mesh.GetPrim()
         materials = [self._materials.bound(prim)]
@@ -109,16 +111,15 @@ class ShapeReader:
             owner[faces] = materials.index(material)
         return materials, owner
 
-    def _primvars(self, material: int | None) -> tuple[tuple[str, ...], str | None]:
+    def _primvars(self, material: MaterialContents | None) -> tuple[tuple[str, ...], str | None]:
         """Names of the attributes that a material needs, and of its texture coordinates."""
         if material is None:
             return COLORS, None
-        contents = self._materials.materials[material]
-        names = contents.texcoords()
+        names = material.texcoords()
         if len(names) > 1:
             what = "further texture coordinates of a material are ignored; a mesh of Mitsuba has one set"
-            self._notes.add(what, contents.name)
-        return tuple(sorted(contents.primvars())), next(iter(names), None)
+            self._notes.add(what, material.name)
+        return tuple(sorted(material.primvars())), next(iter(names), None)
 
     def _shape(
         self,
@@ -126,16 +127,15 @@ class ShapeReader:
         to_world: NDArray[np.float64],
         cage: CageContents,
         normals: NDArray[np.float64] | None,
-        material: int | None,
+        material: MaterialContents | None,
     ) -> ShapeContents:
-        contents = None if material is None else self._materials.materials[material]
-        if contents and contents.texcoords() and cage.texcoords is None:
+        if material and material.texcoords() and cage.texcoords is None:
             # Of those that are there and do not fit, there is a message already.
-            if not UsdGeom.PrimvarsAPI(prim).HasPrimvar(contents.texcoords()[0]):
+            if not UsdGeom.PrimvarsAPI(prim).HasPrimvar(material.texcoords()[0]):
                 what = "prims without texture coordinates have the colour of their texture at (0, 0)"
                 self._notes.add(what, prim.GetPath())
             cage = replace(cage, texcoords=Attribute(np.zeros((len(cage.positions), 2)), "vertex"))
-        names = COLORS if contents is None else contents.primvars()
+        names = COLORS if material is None else material.primvars()
         constants = {name: self._constant(prim, name) for name in names if name not in cage.attributes}
         constants = {name: values for name, values in constants.items() if values}
         radiance = None

@@ -157,19 +157,12 @@ class StageScenes:
             contents, chosen = self._for_picture(contents, rest["sensor"], follows_sensor)
         else:
             contents, parameters = self._with_copies(contents)
-        made = scene_entries(
-            contents,
-            self._notes,
-            parameters,
-            self._surfaces,
-            Textures(self._notes, needed, self._look.texture_size),
-            chosen,
-            has_clear_lamps=bool(rest) and _has_clear_lamps(contents, rest),
-        )
+        textures = Textures(self._notes, needed, self._look.texture_size)
+        scene = scene_entries(contents, rest, self._notes, parameters, self._surfaces, textures, chosen)
         self._notes.warn(self.name)
         if not rest:
             raise CageError(f"{self.name}: none of the meshes can be used; expected one")
-        return {**made, **rest}
+        return scene
 
     def _for_picture(
         self, contents: SceneContents, sensor: SceneNode, follows_sensor: bool
@@ -223,12 +216,10 @@ class StageScenes:
             contents, _ = self._with_copies(given)
             shapes.begin_frame()
             textures = Textures(self._notes, self._needed, self._look.texture_size)
-            is_clear = _has_clear_lamps(contents, rest)
-            made = scene_entries(
-                contents, self._notes, parameters, Surfaces(), textures, loaded=shapes, has_clear_lamps=is_clear
-            )
+            others = {**rest, "sensor": seen}
+            scene = scene_entries(contents, others, self._notes, parameters, Surfaces(), textures, loaded=shapes)
             self._notes.warn(self.name)
-            before = given, seen, studio.load_quietly({**made, **rest, "sensor": seen}, filter_name)
+            before = given, seen, studio.load_quietly(scene, filter_name)
             yield before[2]
 
     def _sensor(self, contents: SceneContents, first: SceneContents, rest: SceneNode) -> SceneNode:
@@ -251,11 +242,6 @@ class StageScenes:
             for file, texels in texels_for_pictures(frames[0], seen).items():
                 needed[file] = max(texels, needed.get(file, 0.0))
         return needed
-
-
-def _has_clear_lamps(contents: SceneContents, rest: SceneNode) -> bool:
-    """Whether the integrator finds lights behind shapes of other lights that are clear."""
-    return rest["integrator"]["type"] == "volpath" or any(light.kind == "dome" for light in contents.lights)
 
 
 def _moved_sensor(loaded: studio.LoadedScene, before: SceneNode, seen: SceneNode) -> bool:

@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from mitsuba_subdivision import files
@@ -21,14 +20,13 @@ from mitsuba_subdivision.messages import timed
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel
 
-from .contents import CameraContents, InstanceContents, LightContents, MaterialContents, SceneContents, ShapeContents
+from .contents import CameraContents, InstanceContents, SceneContents
 from .materialx_layers import with_documents
 from .stage_lights_and_camera import read_camera, read_light, read_settings
 from .stage_materials import MaterialReader
 from .stage_meshes import COLORS, GPRIMS, ShapeReader, are_invertible
 from .stage_warnings import StageWarnings
 
-Part = TypeVar("Part", ShapeContents, LightContents)
 # Draw modes by which a viewer shows a model as it is.
 _FULL_MODES = (None, "default", "inherited")
 # Prims that hold others, or that are read with others.
@@ -120,19 +118,18 @@ class _StageWalk:
             self._notes.add(f'up axis "{up}" is ignored, and y is up; expected y or z', "upAxis")
             up = "y"
         whole = self._below(self._stage.GetPseudoRoot())
-        materials = self._materials.materials
         counts = Counter(instance.group for instance in whole.instances)
         numbers: dict[int, int] = {}
         instances: list[InstanceContents] = []
         for instance in whole.instances:
             prototype = self._prototypes[instance.group]
-            if counts[instance.group] > 1 and _can_be_instanced(prototype, materials):
+            if counts[instance.group] > 1 and _can_be_instanced(prototype):
                 instances.append(replace(instance, group=numbers.setdefault(instance.group, len(numbers))))
             else:
                 _add_copy(whole, prototype, instance)
         groups = [self._prototypes[number].shapes for number in numbers]
         chosen, resolution = self.camera(camera)
-        return SceneContents(up, whole.shapes, groups, instances, materials, whole.lights, chosen, resolution)
+        return SceneContents(up, whole.shapes, groups, instances, whole.lights, chosen, resolution)
 
     def camera(self, path: str | None) -> tuple[CameraContents | None, list[int] | None]:
         """The camera, and the resolution of the stage's render settings; each None if there is none."""
@@ -236,8 +233,8 @@ class _StageWalk:
         if key not in self._inherited:
             parts = list(_parts(prim))
             names: set[str] = set()
-            for number in {self._materials.bound(part) for part in parts if _is_shape(part)}:
-                names.update(COLORS if number is None else self._materials.materials[number].primvars())
+            for material in {self._materials.bound(part) for part in parts if _is_shape(part)}:
+                names.update(COLORS if material is None else material.primvars())
             is_placed = any(UsdGeom.Xformable(part) and UsdGeom.Xformable(part).GetResetXformStack() for part in parts)
             self._inherited[key] = sorted(names), is_placed
         names_read, is_placed = self._inherited[key]
@@ -338,15 +335,11 @@ class _StageWalk:
 
 def _add_copy(contents: SceneContents, prototype: SceneContents, instance: InstanceContents) -> None:
     """Add the shapes and lights of a prototype where an instance is."""
-
-    def placed(part: Part) -> Part:
-        return replace(part, name=f"{instance.name}{part.name}", to_world=instance.to_world @ part.to_world)
-
-    contents.shapes.extend(map(placed, prototype.shapes))
-    contents.lights.extend(map(placed, prototype.lights))
+    contents.shapes.extend(map(instance.placed, prototype.shapes))
+    contents.lights.extend(map(instance.placed, prototype.lights))
 
 
-def _can_be_instanced(prototype: SceneContents, materials: list[MaterialContents]) -> bool:
+def _can_be_instanced(prototype: SceneContents) -> bool:
     """Whether Mitsuba has instances of a prototype.
 
     Instances cannot be emitters, and where they are hit, attributes of meshes are looked up in the wrong place.
@@ -354,7 +347,7 @@ def _can_be_instanced(prototype: SceneContents, materials: list[MaterialContents
     is_hindered = (
         shape.radiance is not None
         or bool(shape.cage.attributes)
-        or (shape.material is not None and materials[shape.material].is_emissive)
+        or (shape.material is not None and shape.material.is_emissive)
         for shape in prototype.shapes
     )
     return bool(prototype.shapes) and not prototype.lights and not any(is_hindered)

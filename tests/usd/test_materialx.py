@@ -128,7 +128,7 @@ def test_variants_and_instances_have_their_documents(tmp_path):
     contents = StageReader(write(tmp_path, "".join(pieces))).at()
     assert (len(contents.instances), len(contents.groups)) == (4, 2)
     placed = sorted(contents.instances, key=lambda instance: instance.to_world[0, 3])
-    materials = [contents.materials[contents.groups[instance.group][0].material] for instance in placed]
+    materials = [contents.groups[instance.group][0].material for instance in placed]
     colors = [material.inputs["base_color"] for material in materials]
     np.testing.assert_allclose(colors[:2], [[0.8, 0.1, 0.05], [0.1, 0.2, 0.9]], rtol=1e-6)
     assert colors[2:] == colors[:2]

@@ -289,12 +289,13 @@ def square(side=1.0, uv_side=1.0, to_world=None, *, has_texcoords=True):
     corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
     texcoords = Attribute(uv_side * corners[:, :2], "vertex") if has_texcoords else None
     cage = CageContents(side * (corners - [0.5, 0.5, 0]), np.array([4]), np.arange(4), texcoords=texcoords)
-    return ShapeContents("/square", cage, np.eye(4) if to_world is None else to_world, material=0)
+    return ShapeContents("/square", cage, np.eye(4) if to_world is None else to_world)
 
 
-def needed_for(*shapes, inputs, **more):
-    contents = SceneContents(shapes=[*shapes], materials=[MaterialContents("/m", inputs)], **more)
-    return texels_for_pictures(contents, [sensor_at(DISTANCE)])
+def needed_for(*shapes, inputs, groups=(), **more):
+    material = MaterialContents("/m", inputs)
+    shapes, *groups = ([replace(shape, material=material) for shape in part] for part in (shapes, *groups))
+    return texels_for_pictures(SceneContents(shapes=shapes, groups=groups, **more), [sensor_at(DISTANCE)])
 
 
 def pixels_of_unit(distance=DISTANCE):
