@@ -3,6 +3,7 @@
 import warnings
 
 import mitsuba as mi
+import numpy as np
 from mitsuba_subdivision.cage import CageWarning
 
 CORNERS = "(-1,-1,-1), (1,-1,-1), (-1,1,-1), (1,1,-1), (-1,-1,1), (1,-1,1), (-1,1,1), (1,1,1)"
@@ -78,6 +79,11 @@ def texture(file, space="sRGB", more="", where="inputs:st.connect = </paint/read
     return nodes + shader(
         "reader", "UsdPrimvarReader_float2", f'string inputs:varname = "{name}"\nfloat2 outputs:result'
     )
+
+
+def flat(path, color=(128, 128, 128), side=4):
+    """Write a picture of one colour, of as many channels as it has."""
+    mi.Bitmap(np.full((side, side, len(color)), color, np.uint8)).write(str(path))
 
 
 ABOVE = moved(translate=(0, 0, 10))

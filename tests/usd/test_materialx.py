@@ -11,7 +11,7 @@ from mitsuba_subdivision.cage.errors import CageError, CageWarning, warn
 from mitsuba_usd.contents import NodeContents, PrimvarContents, TextureContents
 from mitsuba_usd.stage_walk import StageReader
 from pxr import Sdf, Usd
-from usd.stages import POLYGONS, SQUARE, bound, camera, mesh, moved, prim, shader, told, write
+from usd.stages import POLYGONS, SQUARE, bound, camera, flat, mesh, moved, prim, shader, told, write
 
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 
@@ -62,10 +62,6 @@ def stage(tmp_path):
         return write(tmp_path, looks("red.mtlx", *over) + text)
 
     return make
-
-
-def picture(path, color=128, channels=3, side=4):
-    mi.Bitmap(np.full((side, side, channels), color, np.uint8)).write(str(path))
 
 
 def material(path):
@@ -161,8 +157,8 @@ USED = [
 
 def test_graphs_are_expressions_and_affine_mappings_are_those_of_pictures(stage, tmp_path, monkeypatch):
     monkeypatch.setattr("mitsuba_usd.textures.LEAST_PROCEDURAL", 16)
-    picture(tmp_path / "color.png")
-    picture(tmp_path / "normal.png", [128, 128, 255])
+    flat(tmp_path / "color.png")
+    flat(tmp_path / "normal.png", [128, 128, 255])
     text = document(*USED, graph=GRAPH).replace("<materialx ", '<materialx fileprefix="./" ')
     paint = material(stage(text))
     color, normal, rough = (paint.inputs[name] for name in ("base_color", "normal", "roughness"))
@@ -183,7 +179,7 @@ def test_graphs_are_expressions_and_affine_mappings_are_those_of_pictures(stage,
 def test_tiles_and_bumps(stage, tmp_path):
     """The tiles of a picture by their pattern; a height as a normal in tangent space."""
     for tile in (1001, 1002):
-        picture(tmp_path / f"color.{tile}.png")
+        flat(tmp_path / f"color.{tile}.png")
     mi.Bitmap(np.arange(0, 256, 16, dtype=np.uint8)[None].repeat(16, 0)[..., None]).write(str(tmp_path / "height.png"))
     graph = element("image", "tiles", "color3", given("file", "filename", value="color.&lt;UDIM&gt;.png"))
     graph += element("image", "height", "float", given("file", "filename", value="height.png"))
@@ -206,7 +202,7 @@ def test_tiles_and_bumps(stage, tmp_path):
 
 
 def test_a_picture_at_constant_coordinates_is_one_texel(stage, tmp_path):
-    picture(tmp_path / "color.png")
+    flat(tmp_path / "color.png")
     where = given("texcoord", "vector2", value="0.25, 0.75")
     graph = element("image", "spot", "color3", given("file", "filename", value="color.png"), where)
     paint = material(stage(document(given("base_color", "color3", nodename="spot"), graph=graph)))
@@ -271,7 +267,7 @@ def test_colours_are_linear_unless_their_space_is_that_of_srgb(stage, space, is_
 
 
 def test_packages_hold_documents_and_their_pictures(tmp_path):
-    picture(tmp_path / "color.png", 255)
+    flat(tmp_path / "color.png", [255] * 3)
     image = element("image", "i", "color3", given("file", "filename", value="../tex/color.png"))
     (tmp_path / "red.mtlx").write_text(document(given("base_color", "color3", nodename="i"), graph=image))
     write(tmp_path, looks("looks/red.mtlx") + SMOOTH_SQUARE)
@@ -313,7 +309,7 @@ TOLD = [
 
 @pytest.mark.parametrize(("text", "message"), TOLD)
 def test_what_cannot_be_had_is_told_once(stage, tmp_path, text, message):
-    picture(tmp_path / "black.png", 0)
+    flat(tmp_path / "black.png", [0] * 3)
     path = stage(text, RED_SQUARE + RED_SQUARE.replace('"square"', '"other"'))
     _, messages = told(StageReader(path).at)
     assert sum(message in warning for warning in messages) == 1 if message else not messages
@@ -352,7 +348,7 @@ def test_inputs_of_images_and_coordinates_that_are_ignored_are_told_once_by_name
     if "tiled" in node and ("address" in image or "layer" in image):
         # It has none of these.
         message = "inputs that ND_tiledimage_color3 does not have are ignored"
-    picture(tmp_path / "black.png", 0)
+    flat(tmp_path / "black.png", [0] * 3)
     inputs = "asset inputs:file = @black.png@\nfloat2 inputs:texcoord.connect = </Red/where.outputs:out>"
     nodes = shader("image", node, inputs, image, "color3f outputs:out") + shader("where", *where, "float2 outputs:out")
     nodes += shader("tone", "ND_geompropvalue_color3", 'string inputs:geomprop = "tone"', "color3f outputs:out")

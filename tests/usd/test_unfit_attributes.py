@@ -8,7 +8,7 @@ import mitsuba_subdivision as msub
 import numpy as np
 import pytest
 from mitsuba_usd import stage_warnings
-from usd.stages import CUBE, POLYGONS, bound, material, mesh, prim, shader, subset, texture, told, write
+from usd.stages import CUBE, POLYGONS, bound, flat, material, mesh, prim, shader, subset, texture, told, write
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 POINTS, COUNTS, VERTICES = CUBE.splitlines()
@@ -36,7 +36,7 @@ def scene_of(tmp_path, monkeypatch, meshes):
     """A scene of several meshes, and what was told of each, at full length."""
     monkeypatch.setattr(stage_warnings, "_SHOWN", len(meshes))
     monkeypatch.setattr(stage_warnings, "_LENGTH", 10**6)
-    mi.Bitmap(np.zeros((2, 2, 3), np.uint8)).write(str(tmp_path / "black.png"))
+    flat(tmp_path / "black.png", [0] * 3)
     entries, messages = told(scene_at, write(tmp_path, PAINTS + "".join(meshes)))
     scene, more = told(mi.load_dict, entries)
     assert np.isfinite(np.array(mi.render(scene, spp=1))).all()

@@ -305,32 +305,28 @@ def test_instances_that_cannot_be_seen_leave_the_others_there(scene):
 @pytest.mark.parametrize(
     ("above", "root"), [("def Scope", "def"), ("class", "def"), ("over", "def"), ("over", "over"), ("class", "class")]
 )
-def test_prototypes_may_lie_below_a_class_or_an_over(scene, above, root):
+def test_prototypes_may_lie_below_a_class_or_an_over(stage, above, root):
     """As the schema of point instancers recommends; what is a class or an over in a prototype is not shown."""
     hidden = f'class "hidden" {{\n{mesh("hidden", CUBE)}\n}}\nover "more" {{\n{mesh("more", CUBE)}\n}}\n'
-    kind = "over" if root == "over" else f"{root} Xform"
-    places = f"int[] protoIndices = [0, 0, 0, 1]\npoint3f[] positions = {[(-3, 0, 0), (0, 0, 0), (3, 0, 0), (9, 9, 9)]}"
+    kind, places = "over" if root == "over" else f"{root} Xform", [(-3, 0, 0), (0, 0, 0), (3, 0, 0)]
+    positions = f"int[] protoIndices = [0, 0, 0, 1]\npoint3f[] positions = {[*places, (9, 9, 9)]}"
     prototypes = f'{above} "all" {{\n{kind} "proto" {{\n{mesh("cube", CUBE)}{hidden}}}\n}}'
     named = "rel prototypes = [</points/all/proto>, </points/none>]"
-    points = prim("PointInstancer", "points", named, places, prototypes)
     with pytest.warns(CageWarning, match=r"prototypes of .* that are not there are ignored \(/points/none\)"):
-        entries = scene(points)
-    assert {name for name in entries if name.startswith("points")} == {"points_0", "points_1", "points_2"}
-    loaded = mi.load_dict({name: entry for name, entry in entries.items() if name not in ("ground", "key_light")})
-    for x in (-3, 0, 3):
-        si = loaded.ray_intersect(mi.Ray3f(mi.Point3f(x, 0, 9), mi.Vector3f(0, 0, -1)))
-        # The limit of a cube in the middle of a face.
-        np.testing.assert_allclose(np.array(si.p).ravel(), [x, 0, 68 / 81], atol=1e-6)
+        contents = StageReader(stage(prim("PointInstancer", "points", named, positions, prototypes))).at()
+    assert [instance.name for instance in contents.instances] == ["/points/0", "/points/1", "/points/2"]
+    np.testing.assert_array_equal([instance.to_world[:3, 3] for instance in contents.instances], places)
+    ((shape,),) = contents.groups
+    assert shape.name.endswith("cube")
 
 
 @pytest.mark.parametrize(("time", "expected"), [(None, 1), (2, 1), (3, 3)])
-def test_instances_have_velocities(scene, time, expected):
+def test_instances_have_velocities(stage, time, expected):
     """Without a time, they are where they are at their first time."""
-    positions = "point3f[] positions.timeSamples = { 2: [(1, 0, 0)] }"
-    velocities = "vector3f[] velocities.timeSamples = { 2: [(48, 0, 0)] }"
-    loaded = mi.load_dict(scene(instancer(positions, mesh("cube", CUBE), velocities), time=time))
-    (box,) = (shape.bbox() for shape in loaded.shapes() if shape.id() == "points_0_cube")
-    np.testing.assert_allclose(box.center().x, expected, atol=1e-5)
+    positions = stages.stated("point3f[] positions", {2: [(1, 0, 0)]})
+    velocities = stages.stated("vector3f[] velocities", {2: [(48, 0, 0)]})
+    (shape,) = StageReader(stage(instancer(positions, mesh("cube", CUBE), velocities))).at(time).shapes
+    np.testing.assert_allclose(shape.to_world[:3, 3], [expected, 0, 0], atol=1e-5)
 
 
 @pytest.mark.parametrize(("most_faces", "rounding"), [(stage_meshes.MOST_SHARED_FACES, 0), (0, 1e-6)])
@@ -432,10 +428,6 @@ def transform(name, *inputs, kind="UsdTransform2d"):
     return shader(name, kind, f"float2 inputs:in.connect = {READER}", *inputs, "float2 outputs:result")
 
 
-def flat(path, color, side=2):
-    mi.Bitmap(np.full((side, side, len(color)), color, np.uint8)).write(str(path))
-
-
 @pytest.fixture
 def shown(scene, tmp_path):
     """Function that makes a picture of a square that shines with what nodes give, of the texture of four quarters."""
@@ -463,7 +455,7 @@ def package(path, stage):
 
 
 def test_pictures_are_upright_and_in_their_colour_space(shown, tmp_path):
-    flat(tmp_path / "grey.png", [128, 128, 128])
+    stages.flat(tmp_path / "grey.png", [128, 128, 128])
     upright = [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]
     np.testing.assert_array_equal(corners_of(shown(texture("quadrants.png"))), upright)
     packed = msub.usd_scene(package(tmp_path / "all.usdz", tmp_path / "stage.usda"), mi, size=(16, 16))
@@ -487,10 +479,10 @@ def test_tiles_are_where_their_numbers_say(shown, tmp_path, is_complete, scale, 
     """Of other sizes, the first not at the origin; the fallback is seen where there is none."""
     tiles = {1022: [255, 0, 0], 1012: [0, 255, 0], 1013: [0, 0, 255]}
     for number, color in {**tiles, **({1023: [255, 255, 255]} if is_complete else {})}.items():
-        flat(tmp_path / f"tile.{number}.png", color, 8 if number == 1012 else 16)
+        stages.flat(tmp_path / f"tile.{number}.png", color, 8 if number == 1012 else 16)
     # Not tiles of this picture.
     for name in ("tile.1000.png", "tile.10120.png", "other.1014.png"):
-        flat(tmp_path / name, [128, 128, 128], 4)
+        stages.flat(tmp_path / name, [128, 128, 128], 4)
     place = transform("place", "float2 inputs:scale = (2, 2)", "float2 inputs:translation = (1, 1)")
     more = f"float4 inputs:scale = ({scale}, {scale}, {scale}, 1)\nfloat4 inputs:fallback = (1, 0, 1, 1)"
     where = "inputs:st.connect = </paint/place.outputs:result>"
@@ -542,7 +534,7 @@ def test_colours_of_files_with_primaries_of_their_own_are_converted(tmp_path, pr
 
 def test_numbers_come_from_the_channel_that_is_connected(scene, tmp_path):
     """Linear alpha, and a colour's channel as it is decoded."""
-    flat(tmp_path / "four.png", [128, 64, 0, 51])
+    stages.flat(tmp_path / "four.png", [128, 64, 0, 51])
     number = "float inputs:{}.connect = </paint/texture.outputs:{}>\n"
     paint = material(number.format("opacity", "a") + number.format("roughness", "r"), texture("four.png"))
     mask = scene(paint + mesh("square", SMOOTH_SQUARE, bound()))["paint"]
@@ -553,7 +545,7 @@ def test_numbers_come_from_the_channel_that_is_connected(scene, tmp_path):
 
 def test_textures_have_a_limit_that_can_be_set(scene, tmp_path):
     """The square is 32 pixels wide in the picture, so that 64 texels show."""
-    flat(tmp_path / "a.png", [128, 128, 128], 256)
+    stages.flat(tmp_path / "a.png", [128, 128, 128], 256)
     text = CAMERA + material(COLORED, texture("a.png")) + mesh("square", SMOOTH_SQUARE, bound())
     for limit, side in ((None, 64), (100, 64), (24, 16)):
         paint = scene(text, size=(32, 32), texture_size=limit)["paint"]
@@ -898,7 +890,7 @@ IGNORED = [
 
 @pytest.mark.parametrize(("text", "message", "end"), IGNORED)
 def test_what_is_not_followed_is_told_once_by_name(scene, tmp_path, text, message, end):
-    flat(tmp_path / "black.png", [0, 0, 0])
+    stages.flat(tmp_path / "black.png", [0, 0, 0])
     text += prim("RenderProduct", "product") + mesh("square", SQUARE)
     entries, (warning,) = told(scene, text, NAMED if "settings" in text else "")
     assert message in warning
