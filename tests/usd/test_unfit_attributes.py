@@ -33,20 +33,19 @@ scene_at = partial(msub.usd_scene, mi=mi, tessellation_rate=1, shading="vertex",
 
 
 def scene_of(tmp_path, monkeypatch, meshes):
-    """A scene of several meshes, and what was told of each, at full length."""
+    """Points of each mesh of a scene by its name, each once, and what was told of the meshes, at full length."""
     monkeypatch.setattr(stage_warnings, "_SHOWN", len(meshes))
     monkeypatch.setattr(stage_warnings, "_LENGTH", 10**6)
     flat(tmp_path / "black.png", [0] * 3)
     entries, messages = told(scene_at, write(tmp_path, PAINTS + "".join(meshes)))
-    scene, more = told(mi.load_dict, entries)
+    scene, more = told(mi.load_dict, entries, optimize=False)
     assert np.isfinite(np.array(mi.render(scene, spp=1))).all()
-    return entries, " ".join([*messages, *more])
-
-
-def points_of(shape):
-    """Vertices of a shape, each once: polygons have the same ones, whether or not faces share them."""
-    shape = shape if isinstance(shape, mi.Object) else mi.load_dict({**shape, "bsdf": {"type": "diffuse"}})
-    return np.unique(np.array(mi.traverse(shape)["vertex_positions"]).reshape(-1, 3), axis=0)
+    shapes = {name: shape for shape in scene.shapes() if (name := shape.id()).startswith("m")}
+    assert shapes.keys() == {name for name in entries if name.startswith("m")}
+    points = {name: np.array(mi.traverse(shape)["vertex_positions"]) for name, shape in shapes.items()}
+    # Polygons have the same ones, whether or not faces share them.
+    points = {name: np.unique(values.reshape(-1, 3), axis=0) for name, values in points.items()}
+    return points, " ".join([*messages, *more])
 
 
 CREASE = "int[] creaseIndices = {}\nint[] creaseLengths = {}\nfloat[] creaseSharpnesses = {}"
@@ -131,18 +130,17 @@ UNFIT = [
 ]
 
 
-@pytest.mark.parametrize("flat", ["", POLYGONS], ids=["smooth", "flat"])
-def test_what_does_not_fit_its_mesh_is_left_out_by_name_and_the_mesh_stays(tmp_path, monkeypatch, flat):
+@pytest.mark.parametrize("head", ["", POLYGONS], ids=["smooth", "flat"])
+def test_what_does_not_fit_its_mesh_is_left_out_by_name_and_the_mesh_stays(tmp_path, monkeypatch, head):
     """Each in a mesh of its own, told once; the mesh is what it is without."""
-    bodies = [body if "subdivisionScheme" in body else flat + body for _, body in UNFIT]
-    entries, text = scene_of(tmp_path, monkeypatch, [mesh_of(number, body) for number, body in enumerate(bodies)])
+    bodies = [body if "subdivisionScheme" in body else head + body for _, body in UNFIT]
+    points, text = scene_of(tmp_path, monkeypatch, [mesh_of(number, body) for number, body in enumerate(bodies)])
     plain, _ = scene_of(tmp_path, monkeypatch, [mesh_of(0, ""), mesh_of(1, POLYGONS)])
-    expected = [points_of(plain[name]) for name in ("m0", "m1")]
     wrong = []
     for number, ((name, _), body) in enumerate(zip(UNFIT, bodies, strict=True)):
         # The prim with the problem, or the attribute in a list of those that have the same problem.
         places = re.findall(rf"/m{number}\b[^,)]*", text)
-        there = f"m{number}" in entries and np.array_equal(points_of(entries[f"m{number}"]), expected[POLYGONS in body])
+        there = np.array_equal(points.get(f"m{number}"), plain[f"m{int(POLYGONS in body)}"])
         if len(places) != 1 or name.lower() not in places[0].lower() or not there:
             wrong.append((name, body, places, there))
     assert not wrong, "\n".join(map(str, wrong))
@@ -159,12 +157,12 @@ UNUSABLE += [(POINTS, counts, VERTICES) for counts in BAD_COUNTS]
 UNUSABLE += [(POINTS, COUNTS, vertices) for vertices in BAD_VERTICES]
 
 
-@pytest.mark.parametrize("flat", ["", POLYGONS], ids=["smooth", "flat"])
-def test_a_mesh_whose_points_or_faces_cannot_be_meant_is_left_out_alone(tmp_path, monkeypatch, flat):
+@pytest.mark.parametrize("head", ["", POLYGONS], ids=["smooth", "flat"])
+def test_a_mesh_whose_points_or_faces_cannot_be_meant_is_left_out_alone(tmp_path, monkeypatch, head):
     color = primvar("displayColor", "color3f", "(0, 1, 0)", "vertex", 8)
-    unusable = [mesh_of(number, flat + color, faces) for number, faces in enumerate(UNUSABLE)]
-    entries, text = scene_of(tmp_path, monkeypatch, [*unusable, mesh_of(len(unusable), flat)])
-    assert [name for name in entries if name.startswith("m")] == [f"m{len(unusable)}"]
+    unusable = [mesh_of(number, head + color, faces) for number, faces in enumerate(UNUSABLE)]
+    points, text = scene_of(tmp_path, monkeypatch, [*unusable, mesh_of(len(unusable), head)])
+    assert list(points) == [f"m{len(unusable)}"]
     assert [len(re.findall(rf"/m{number}\b", text)) for number in range(len(unusable))] == [1] * len(unusable)
     assert {"points", "faceVertexCounts", "faceVertexIndices"} <= set(re.findall(r"\w+", text))
 
