@@ -160,11 +160,9 @@ class MeshBuffers:
         """Flat 3-vectors of all vertices of the mesh, from those of the tessellation."""
         if self._copied is None:
             return flat
-        return (
-            flat.reshape(-1, 3)[self._copied].ravel()
-            if self._types is None
-            else self._types.gathered(flat, self._copied)
-        )
+        if self._types is None:
+            return flat.reshape(-1, 3)[self._copied].ravel()
+        return self._types.gathered(flat, self._copied)
 
     def _placed(self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer) -> dict[str, FloatBuffer]:
         """Copy, displace and place vertices, and update exact shading."""

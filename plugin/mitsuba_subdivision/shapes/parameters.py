@@ -7,6 +7,7 @@ import pickle
 import time as clock
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
+from functools import partial
 from hashlib import blake2b
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
@@ -124,14 +125,15 @@ def read_parameters(props: mi.Properties) -> Parameters:
     from ..schemes import scheme_named
 
     _reject_unknown(props)
-    name = value_of(props, "scheme")
+    value = partial(value_of, props)
+    name = value("scheme")
     with errors_about("scheme"):
         scheme = None if name is None else scheme_named(name)
     tessellation = _tessellation(props)
-    shading, evaluator, offset = (value_of(props, name) for name in ("shading", "evaluator", "sample_offset"))
+    shading, evaluator, offset = value("shading"), value("evaluator"), value("sample_offset")
     if evaluator == "stam" and offset == 0:
         raise ValueError(f'parameter "sample_offset" is {offset}; expected a number above 0 for "evaluator" = "stam"')
-    face_normals, _ = (value_of(props, name) for name in ("face_normals", "flip_normals"))
+    face_normals, _ = value("face_normals"), value("flip_normals")
     if face_normals and shading == "exact":
         raise ValueError(
             'parameters "face_normals" and "shading" contradict each other; expected flat or exact shading'
@@ -146,7 +148,7 @@ def read_parameters(props: mi.Properties) -> Parameters:
 
     cage = _cage(props, None if scheme is None else scheme.name)
     to_world = checked_matrix(props["to_world"]) if "to_world" in props else np.eye(4)
-    source = value_of(props, "cage_name") or cage.source.name
+    source = value("cage_name") or cage.source.name
     if "filename" in props:
         source = os.path.basename(str(props["filename"]))
     surface = LimitSurface(cage, scheme)
