@@ -30,11 +30,8 @@ def test_predicted_triangles_are_those_of_the_tessellation(cage, scheme, rate):
 def test_a_sheet():
     tags = {"creases": [(6, 7, 10), (7, 12, 1.5)], "corners": [(18, 10), (17, 0.5)], "holes": [5]}
     inspected = inspect(LimitSurface(sheet(4, 4, **tags)))
-    assert (inspected["boundary_edge_count"], inspected["boundary_loop_count"], inspected["component_count"]) == (
-        16,
-        1,
-        1,
-    )
+    counts = {"boundary_edge_count": 16, "boundary_loop_count": 1, "component_count": 1}
+    assert inspected.items() >= counts.items()
     once = ("infinitely sharp edges", "semi-sharp edges", "corners", "semi-sharp vertices", "holes")
     none = {"non-manifold edges": 0, "non-manifold vertices": 0}
     assert inspected["sharp"] == {**dict.fromkeys(once, 1), "darts": 2, **none}
