@@ -1,7 +1,8 @@
-"""What the command line tells of wrong input: one line, without tracebacks."""
+"""What the command line tells: of wrong input one line, without tracebacks; and of long work how far it is."""
 
 import dataclasses
 import errno
+import io
 import os
 import re
 import subprocess
@@ -11,12 +12,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from mitsuba_subdivision import example_file
+from mitsuba_subdivision import example_file, messages
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.figures import FIGURES, FigureOptions
 from mitsuba_subdivision.figures.output import write_figure
-from mitsuba_subdivision.messages import print_error
+from mitsuba_subdivision.messages import counted, print_error, print_remark, timed
 from mitsuba_subdivision.regression.image import write_exr
 
 SCENE = """<scene version="3.0.0"><integrator type="direct"/>
@@ -263,3 +264,47 @@ CAUSED.__cause__ = RuntimeError("the texture is odd")
 def test_errors_are_sentences(capsys, error, told):
     print_error(error)
     assert capsys.readouterr().err == f"mitsuba-subdivision: error: {told}\n"
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def terminal(monkeypatch):
+    def replaced(stream, patience=0.0):
+        monkeypatch.setattr("sys.stderr", stream)
+        monkeypatch.setattr(messages, "PATIENCE", patience)
+        return stream
+
+    return replaced
+
+
+def test_a_line_counts_and_is_wiped_and_messages_stand_on_lines_of_their_own(terminal):
+    stream = terminal(Terminal())
+    assert list(counted("abc", "Letters")) == ["a", "b", "c"]
+    assert "Letters" in stream.getvalue()
+    assert not stream.getvalue().split("\r")[-1].strip()
+    for letter in counted("ab", "Letters"):
+        print_remark(letter)
+    assert all(f"\r\x1b[Kmitsuba-subdivision: {letter}\n" in stream.getvalue() for letter in "ab")
+
+
+@pytest.mark.parametrize(("kind", "patience"), [(Terminal, 60.0), (io.StringIO, 0.0)])
+def test_short_work_and_pipes_show_nothing(terminal, kind, patience):
+    stream = terminal(kind(), patience)
+    assert list(counted([1, 2], "Numbers")) == [1, 2]
+    assert not stream.getvalue()
+
+
+def test_a_step_is_told_and_wiped(terminal):
+    stream = terminal(Terminal())
+    with timed("Rendering") as at:
+        at("part 2 of 3")
+    assert "Rendering part 2 of 3" in stream.getvalue()
+    assert not stream.getvalue().split("\r")[-1].strip()
+    terminal(pipe := io.StringIO())
+    with timed("Rendering") as at:
+        at("part 2 of 3")
+    assert not pipe.getvalue()
