@@ -2,10 +2,10 @@
 
 import sys
 
-import drjit as dr
 import numpy as np
 import pytest
 from gradients.surfaces import ALL
+from kernels.surfaces import derivatives_both_ways
 from mitsuba_subdivision.kernels.vertex_kernel import VertexKernel, placed
 from mitsuba_subdivision.llvm import llvm_problem
 from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
@@ -63,29 +63,11 @@ def test_forward_reverse_and_differences_agree(name, tessellation, mirror, np_rn
     move, turn = edge * np_rng.normal(size=positions.shape), np.vstack([np_rng.normal(size=(3, 4)), np.zeros(4)])
     expected = extrapolated(lambda step: on_host(table, positions + step * move, start + step * turn))
 
-    def given():
-        points, matrix = arrays.Float64(positions.ravel()), arrays.Matrix4f64(start)
-        dr.enable_grad(points, matrix)
-        return points, matrix
-
-    points, matrix = given()
-    dr.set_grad(points, arrays.Float64(move.ravel()))
-    dr.set_grad(matrix, arrays.Matrix4f64(turn))
-    dr.forward_to(*(moving := vertices(points, matrix)))
-    for values, placed_on_host in zip(moving, on_host(table, positions, start), strict=True):
-        np.testing.assert_allclose(np.array(values), placed_on_host.ravel(), rtol=0, atol=100 * ROUNDING)
-    forward = [np.array(dr.grad(array)).reshape(-1, 3) for array in moving]
-    for derivative, difference in zip(forward, expected, strict=True):
-        assert np.abs(derivative - difference).max() <= DIFFERENCES * np.abs(difference).max()
-
-    weights = [np_rng.normal(size=array.shape) for array in expected]
-    points, matrix = given()
-    pairs = zip(vertices(points, matrix), weights, strict=True)
-    dr.backward(sum(dr.sum(value * arrays.Float64(weight.ravel())) for value, weight in pairs))
-    by_points, by_matrix = (np.array(dr.grad(array)) for array in (points, matrix))
-    reverse = by_points @ move.ravel() + (by_matrix.reshape(4, 4) * turn).sum()
-    products = np.concatenate([(a * b).ravel() for a, b in zip(forward, weights, strict=True)])
-    assert abs(reverse - products.sum()) <= ROUNDING * np.abs(products).sum()
+    inputs = arrays.Float64(positions.ravel()), arrays.Matrix4f64(start)
+    changes = arrays.Float64(move.ravel()), arrays.Matrix4f64(turn)
+    derivatives = derivatives_both_ways(vertices, inputs, changes, np_rng, ROUNDING)
+    for derivative, difference in zip(derivatives, expected, strict=True):
+        assert np.abs(derivative.reshape(-1, 3) - difference).max() <= DIFFERENCES * np.abs(difference).max()
 
 
 def test_adaptive_rates_differ():

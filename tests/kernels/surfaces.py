@@ -151,3 +151,24 @@ def aimed(surface, rng, count, *, steep=0.3, near=0.05, deepest=4):
     start = np.clip(start - beyond, 0, 1)
     o, d = target.p - rng.uniform(0.5, 3, (count, 1)) * d, rng.uniform(0.5, 2, (count, 1)) * d
     return target.p[kept], o[kept], d[kept], [values[kept] for values in (element, start, corner)]
+
+
+def derivatives_both_ways(outputs_of, inputs, changes, rng, rounding):
+    """Changes of outputs by those of inputs, as ``(n, k)`` numbers; reverse mode has to be of the same linear map."""
+    dr.enable_grad(inputs)
+    outputs = outputs_of(*inputs)
+    dr.set_grad(inputs, changes)
+    dr.enqueue(dr.ADMode.Forward, *inputs)
+    dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearNone)
+    forward = [np.array(gradient).T for gradient in computed([dr.grad(output) for output in outputs])]
+    dr.clear_grad(inputs)
+    outputs, seeds = outputs_of(*inputs), [rng.normal(size=derivative.shape) for derivative in forward]
+    for output, seed in zip(outputs, seeds, strict=True):
+        dr.set_grad(output, upload(type(output), seed))
+    dr.enqueue(dr.ADMode.Backward, *outputs)
+    dr.traverse(dr.ADMode.Backward)
+    gradients = computed([dr.grad(value) for value in inputs])
+    products = np.concatenate([(f * s).ravel() for f, s in zip(forward, seeds, strict=True)])
+    product = sum((np.array(c) * np.array(g)).sum() for c, g in zip(changes, gradients, strict=True))
+    assert abs(product - products.sum()) <= rounding * np.abs(products).sum()
+    return forward

@@ -361,23 +361,17 @@ def test_light_passes_through():
         assert seen.mean() == pytest.approx(fine.mean(), rel=2 * ENERGY)
 
 
-@pytest.mark.parametrize(("kind", "tolerance"), [("instance", 10 * NORMAL), ("merge", NORMAL)])
-def test_instances_and_merged_shapes_are_met_as_others(kind, tolerance):
+# Instances are in test_interaction_hook.py.
+def test_merged_shapes_are_met_as_others():
     to_world = mi.ScalarTransform4f().translate([1, 2, 3]).rotate([0.6, 0.8, 0], 50).scale([1, 0.6, 1.4])
-    seen_along = camera_rays(RESOLUTION, origin=(5, -4, 5), target=(1, 2, 3), fov=16)
-    placed = make(cube(), to_world=to_world)
-    if kind == "instance":
-        instance = {"type": "instance", "group": {"type": "ref", "id": "group"}, "to_world": to_world}
-        scene = scene_with(group={"type": "shapegroup", "shape": make(cube())}, instance=instance)
-    else:
-        aside = make(cube(), to_world=mi.ScalarTransform4f().translate([9, 0, 0]))
-        scene = scene_with(merged={"type": "merge", "aside": aside, "placed": placed})
-    si, expected = scene.ray_intersect(seen_along), hits(placed, seen_along, mi.RayFlags.All)
+    along = camera_rays(RESOLUTION, origin=(5, -4, 5), target=(1, 2, 3), fov=16)
+    placed, aside = (make(cube(), to_world=t) for t in (to_world, mi.ScalarTransform4f().translate([9, 0, 0])))
+    scene = scene_with(merged={"type": "merge", "aside": aside, "placed": placed})
+    si, expected = scene.ray_intersect(along), hits(placed, along, mi.RayFlags.All)
     seen = inside(si, expected)
     assert seen.sum() > RESOLUTION
-    np.testing.assert_allclose(rows(si.sh_frame.n)[seen], rows(expected.sh_frame.n)[seen], atol=tolerance)
-    np.testing.assert_allclose(rows(si.uv)[seen], rows(expected.uv)[seen], atol=DERIVATIVE)
-    np.testing.assert_allclose(rows(si.dp_du)[seen], rows(expected.dp_du)[seen], atol=DERIVATIVE)
+    for value, other in ((si.sh_frame.n, expected.sh_frame.n), (si.uv, expected.uv), (si.dp_du, expected.dp_du)):
+        np.testing.assert_allclose(rows(value)[seen], rows(other)[seen], atol=NORMAL)
 
 
 @pytest.mark.usefixtures("no_other_scene")

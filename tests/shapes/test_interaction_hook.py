@@ -253,18 +253,24 @@ def asked(monkeypatch, no_other_scene):  # noqa: ARG001
     return shadings
 
 
+def placement(place):
+    return mi.ScalarTransform4f().translate([2 * place, 0, 0]).rotate([0, 0, 1], 10 * place).scale([1, 0.9, 1.1])
+
+
 def instance(group, place):
-    to_world = mi.ScalarTransform4f().translate([2 * place, 0, 0]).rotate([0, 0, 1], 10 * place)
-    return {"type": "instance", "to_world": to_world, "group": {"type": "ref", "id": group}}
+    return {"type": "instance", "to_world": placement(place), "group": {"type": "ref", "id": group}}
+
+
+def shapes_of(number, count, within=None):
+    """Cubes above each other, and other shapes."""
+    place = (within or mi.ScalarTransform4f()).translate
+    shapes = {f"m{number}_{k}": cube(to_world=place([0, 0, 2 * k]).scale(1 + 0.1 * number)) for k in range(count)}
+    shapes[f"flat{number}"] = {"type": "rectangle", "to_world": place([0, 0, -2]).scale(0.5)}
+    return {**shapes, f"vertex{number}": cube(shading="vertex", face_normals=True, to_world=place([0, 0, -4]))}
 
 
 def members(number, count):
-    """Cubes above each other, and other shapes in the same group."""
-    place = mi.ScalarTransform4f().translate
-    shapes = {f"m{number}_{k}": cube(to_world=place([0, 0, 2 * k]).scale(1 + 0.1 * number)) for k in range(count)}
-    shapes[f"ball{number}"] = {"type": "sphere", "radius": 0.5, "center": [0, 0, -2]}
-    shapes[f"vertex{number}"] = cube(shading="vertex", to_world=place([0, 0, -4]))
-    return {"type": "shapegroup", **shapes}
+    return {"type": "shapegroup", **shapes_of(number, count)}
 
 
 @llvm
@@ -280,34 +286,31 @@ def test_instances_ask_the_shapes_of_their_own_group_only(asked):
 
 
 @llvm
-def test_groups_side_by_side_are_as_each_alone():
+def test_instances_of_groups_side_by_side_are_as_placed_shapes():
     """Points, normals and their derivatives, of exact and of other shapes; in a frozen function, too."""
     x = np.linspace(-0.7, 0.7, 60, dtype=np.float32)
     origins = np.stack([6 + x, 0.3 * x, np.tile([5, -1, -3], len(x) // 3)], axis=1)
     ray = mi.Ray3f(upload(mi.Point3f, origins), mi.Vector3f(0.1, 0, -1))
-    key = "group1.m1_0.control_points"
 
-    def scene_of(*groups):
-        instances = {f"of{g}": instance(f"group{g}", 3 * g) for g in groups}
-        return scene_with(**{f"group{g}": members(g, 1) for g in groups}, **instances)
-
-    def met_in(scene):
+    def met_in(scene, key):
         parameters = mi.traverse(scene)
         dr.enable_grad(parameters[key])
         parameters.update()
         si = scene.ray_intersect(ray)
         dr.backward(dr.sum(dr.select(si.is_valid(), dr.dot(si.p + si.sh_frame.n, mi.Vector3f(1, 2, 3)), 0)))
-        values, gradient = (*si.p, *si.sh_frame.n, *si.dp_du, si.is_valid()), dr.grad(parameters[key])
+        values, gradient = (*si.p, *si.sh_frame.n, *si.dp_du, *si.uv, si.is_valid()), dr.grad(parameters[key])
         # In one kernel.
         dr.eval(values, gradient)
         return np.array([np.array(value) for value in values]), np.array(gradient)
 
-    both = scene_of(0, 1)
+    both = scene_with(group0=members(0, 1), group1=members(1, 1), of0=instance("group0", 0), of1=instance("group1", 3))
     normals = np.array(dr.freeze(lambda scene, ray: scene.ray_intersect(ray).sh_frame.n)(both, ray))
-    (values, gradient), (expected, expected_gradient) = met_in(both), met_in(scene_of(1))
+    values, gradient = met_in(both, "group1.m1_0.control_points")
+    expected, expected_gradient = met_in(scene_with(**shapes_of(1, 1, placement(3))), "m1_0.control_points")
     assert expected[-1].mean() > 0.5
     assert np.abs(expected_gradient).max() > 0.1
-    np.testing.assert_allclose(values, expected, atol=1e-5)
+    # Points of instances are rounded in the space of their group as well.
+    np.testing.assert_allclose(values, expected, atol=1e-4)
     np.testing.assert_allclose(values[3:6], normals, atol=1e-6)
     np.testing.assert_allclose(gradient, expected_gradient, atol=1e-3)
 

@@ -1,6 +1,6 @@
 """The plugin is there in every variant, in any order of import and `set_variant`; exact shading, where it works."""
 
-import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import drjit as dr
@@ -72,18 +72,11 @@ def test_a_library_that_aborts_is_warned_of_where_an_llvm_variant_is_set_and_now
 
 @scalar
 def test_known_variants_are_registered_once_from_many_threads():
-    before, registered = register_variant("scalar_rgb"), []
+    before = register_variant("scalar_rgb")
     msub.register()
     assert register_variant("scalar_rgb") is before
-    threads = [
-        threading.Thread(target=lambda: registered.append(register_variant("scalar_spectral"))) for _ in range(8)
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(registered) == 8
-    assert len(set(registered)) == 1
+    with ThreadPoolExecutor(8) as pool:
+        assert len(set(pool.map(register_variant, ["scalar_spectral"] * 8))) == 1
     with pytest.raises(ValueError, match=r'unknown variant "scalar_grb"; expected one of .*scalar_rgb'):
         register_variant("scalar_grb")
 
