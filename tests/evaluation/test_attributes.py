@@ -180,32 +180,6 @@ def test_without_seams_values_are_subdivided_as_points_are(scheme, cage, np_rng)
                 assert surface.channel(name).layout.patches is surface.patches
 
 
-# Modes do not choose seams, but how values move there, if at all.
-@EVERY_CAGE
-@pytest.mark.parametrize("mode", ["corners_plus2", "all"])
-def test_sides_of_an_edge_differ_on_seams_only(scheme, cage, mode, np_rng):
-    indices = random_indices(cage, np_rng, "joined islands")
-    surface = LimitSurface(textured(cage, indices, np_rng, face_varying=mode), scheme)
-    t = cage.topology
-    half_edges = np.flatnonzero(t.twin > np.arange(t.half_edge_count))
-    twins = t.twin[half_edges]
-    if scheme == "catmull_clark":
-        # Seen from a polygon's corner the parameters reach the middle of an edge only.
-        whole = (t.face_sizes[t.face[half_edges]] == 4) & (t.face_sizes[t.face[twins]] == 4)
-        half_edges, twins = half_edges[whole], twins[whole]
-
-    def along(side, parameter):
-        face = t.face[side]
-        uv = np.stack([np.full(len(side), parameter), np.zeros(len(side))], axis=1)
-        return surface.evaluate_attribute("texcoords", face, uv, side - t.face_offsets[face])
-
-    at_start, at_end = indices[half_edges] == indices[t.next[twins]], indices[t.next[half_edges]] == indices[twins]
-    # On seams, too, its ends may agree.
-    for parameter, agrees in ((0, at_start), (0.25, at_start & at_end), (0.5, at_start & at_end), (1, at_end)):
-        apart = np.abs(along(half_edges, parameter) - along(twins, 1 - parameter)).max(axis=1)
-        np.testing.assert_array_equal(apart > 1e-9, ~agrees)
-
-
 @pytest.mark.core
 @EVERY_CAGE
 def test_linear_values_are_bilinear_over_each_face(scheme, cage, np_rng):
