@@ -176,6 +176,8 @@ def test_methods_under_exact_shading_are_of_the_surface_or_refused():
         nearest = surface.closest_point(rows(si.p)[:3])
         np.testing.assert_allclose(rows(si.sh_frame.n)[:3], nearest.n, atol=1e-3)
         assert nearest.distance.max() <= HIT
+        frozen = dr.freeze(lambda shape, uv: shape.eval_parameterization(uv).p)
+        np.testing.assert_array_equal(frozen(shape, upload(mi.Point2f, uv + shift)), si.p)
         update(shape, cage_texcoords=mi.traverse(shape)["cage_texcoords"] + 10)
     normals = ": the mesh has no normals .* exact shading"
     refused(f"vertex_normal{normals}", shape.vertex_normal, 0)

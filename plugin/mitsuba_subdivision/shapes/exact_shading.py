@@ -38,8 +38,8 @@ _PARAMETERS = int(mi.RayFlags.UV) | int(mi.RayFlags.dPdUV) | _NORMAL_DERIVATIVES
 _KINDS = ("are on the ray", "are along the normal nearby", "are shaded where the triangle lies in the surface")
 _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 
-# Number of fixed-point iterations of `ExactShading.at_texcoords`. Each removes most of the difference between texture
-# coordinates on the surface and on its triangles.
+# Number of fixed-point iterations of `ExactShading.hit_by_texcoords`. Each removes most of the difference between
+# texture coordinates on the surface and on its triangles.
 STEPS = 3
 
 
@@ -79,8 +79,6 @@ class ExactShading:
         self._upsampling = spectral_upsampling(variant, sizes)
         self._shape: Callable[[], mi.Mesh | None] = lambda: None
         self._sign = 1.0
-        # The triangles over current texture coordinates; None until they are needed.
-        self.texture_scene: mi.Scene | None = None
 
     def set_triangles(self, table: VertexTable, kept: IntArray | None = None) -> None:
         """Set the triangles of the shape before the first hit: all of a table, or those with the indices ``kept``."""
@@ -205,12 +203,15 @@ class ExactShading:
         value = self._attributes[name](location, active)[0]
         return self._upsampling[name](value) if name in self._upsampling else value
 
-    def at_texcoords(self, uv: Vector2, ray_flags: int, active: Mask) -> mi.SurfaceInteraction3f:
+    def hit_by_texcoords(
+        self,
+        scene: mi.Scene,  # Made by `texture_scene`, of current texture coordinates
+        uv: Vector2,
+        ray_flags: int,
+        active: Mask,
+    ) -> mi.SurfaceInteraction3f:
         """Interaction at the point of the shape with given texture coordinates; invalid where there is none."""
         variant, shape = self._variant, cast("mi.Mesh", self._shape())
-        if self.texture_scene is None:
-            self.texture_scene = self._over_texcoords(shape.face_count())
-        scene = self.texture_scene
 
         def at(uv: Vector2, active: Mask) -> mi.SurfaceInteraction3f:
             uv_ray = variant.Ray3f(variant.Point3f(uv.x, uv.y, -1), variant.Vector3f(0, 0, 1))
@@ -233,8 +234,8 @@ class ExactShading:
             si = dr.select(next_si.is_valid(), next_si, si)
         return si
 
-    def _over_texcoords(self, face_count: int) -> mi.Scene:
-        """Scene of the shape's triangles over the plane of texture coordinates."""
+    def texture_scene(self, face_count: int) -> mi.Scene:
+        """Scene of the shape's triangles over the plane of texture coordinates, in which hits are looked up."""
         index, b1, b2 = np.repeat(np.arange(face_count), 3), *np.tile(np.eye(3)[1:], face_count)
         if self._are_turned:
             b1, b2 = b2, b1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from weakref import WeakMethod
 
 import drjit as dr
@@ -129,6 +129,8 @@ def make_subdivision(
             self._cage.set_triangles(attributes, self._at_vertices)
             self._mesh.set_triangles(table, attributes.layout, kept)
             self._has_outlines = False
+            # The triangles over texture coordinates; None until they are needed. Frozen functions find its arrays here.
+            self._texture_scene: Any = None
 
         def _assemble(self, *, moves_points: bool) -> None:
             """Fill all buffers of the mesh."""
@@ -172,8 +174,7 @@ def make_subdivision(
             # Check parameters before anything changes.
             to_world, tessellation = self._checked(keys)
             attributes = self._cage.update(keys)
-            if self._exact is not None:
-                self._exact.texture_scene = None
+            self._texture_scene = None
             if "faces" in keys:
                 # Mitsuba discards the silhouette edges of old faces.
                 self._has_outlines = False
@@ -344,7 +345,10 @@ def make_subdivision(
             self._require_at_vertices("eval_parameterization", "texture coordinates", self._has_texcoords)
             if self._exact is None or self.has_vertex_texcoords():
                 return super().eval_parameterization(uv, ray_flags, active)
-            return self._exact.at_texcoords(variant.Point2f(uv), int(ray_flags), variant.Mask(active))
+            if self._texture_scene is None:
+                self._texture_scene = self._exact.texture_scene(self.face_count())
+            at = variant.Point2f(uv), int(ray_flags), variant.Mask(active)
+            return self._exact.hit_by_texcoords(self._texture_scene, *at)
 
         def recompute_vertex_normals(self) -> None:
             """Replace the normals of the limit surface by averages of triangle normals."""
