@@ -905,11 +905,11 @@ def test_render_settings_that_the_stage_does_not_name_are_told(stage, head):
         assert StageReader(path).at().resolution is None
 
 
-def test_of_several_cameras_the_first_is_used_and_told(scene):
+def test_of_several_cameras_the_first_is_used_and_told(stage):
     first, other, cube = camera(name="a", focal_length=60), camera(name="b"), mesh("cube", CUBE)
-    entries, (message,) = told(scene, first + other + cube)
+    contents, (message,) = told(StageReader(stage(first + other + cube)).at)
     assert "there are several cameras, and the first is used (/a, /b)" in message
-    assert entries["sensor"]["fov"] == scene(first + cube)["sensor"]["fov"]
+    assert contents.camera.focal_length == 60
 
 
 @pytest.mark.parametrize("scheme", ["none", "catmullClark"])
