@@ -190,13 +190,8 @@ def rest_rows(patch: IrregularPatch) -> FloatArray:
     """Return a bound of the distance from the extraordinary point to the surface at a level and all later ones.
 
     Returns ``(r, K)``, read-only, to be multiplied by the absolute eigen-coordinates of the level, which
-    are ``Tⁿ`` times those of the patch. The largest of the r sums is the bound. A weaker bound is the one sum with the
-    largest entry of each column.
-
-    The point is ``ĉ_1``, and the pieces of level n have the Bernstein coefficients ``Φ Tⁿ ĉ``. So along any axis, all
-    pieces of level n and later are within ``max_k Σ_{i ≥ 2} |φ_ki| |Tⁿ ĉ|_i`` of the point, where ``φ_ki`` is the
-    largest entry of ``Φ Tʲ`` for any j. It is the entry for j = 0, except in Jordan blocks, whose powers grow before
-    they shrink.
+    are ``Tⁿ`` times those of the patch. The largest of the r sums is the bound, see section 14 of
+    plugin/MATHEMATICS.md. A weaker bound is the one sum with the largest entry of each column.
     """
     rows, step = level_rows(patch, 0).reshape(-1, len(patch.basis.eigenvalues)), patch.basis.block_matrix()
     bound = np.abs(rows)

@@ -135,13 +135,9 @@ class PolynomialBasis:
     """
 
     domain: ParameterDomain
-    powers: IntArray  # (m, 2) int64: a and b of the monomials ``(u - u_0)^a (v - v_0)^b``. The first is the constant.
+    # (m, 2) int64: a and b of the monomials ``(u - u_0)^a (v - v_0)^b`` about the middle. The first is the constant.
+    powers: IntArray
     matrix: FloatArray  # (m, R) float64: coefficients of the basis functions, in columns
-
-    @property
-    def centre(self) -> FloatArray:
-        """``(2,)`` float64, middle of the domain, ``(u_0, v_0)``."""
-        return self.domain.centre
 
     @cached_property
     def bernstein(self) -> BernsteinBasis:
@@ -156,7 +152,7 @@ class PolynomialBasis:
 
     def monomials(self, uv: FloatArray) -> FloatArray:
         """Return ``(s, m)`` values of the monomials at ``(s, 2)`` parameters."""
-        return monomial_values(self.powers, uv - self.centre)[0].T
+        return monomial_values(self.powers, uv - self.domain.centre)[0].T
 
 
 def monomial_values(powers: IntArray, st: FloatArray) -> FloatArray:

@@ -243,7 +243,7 @@ class PieceKernel:
         scheme = table.patches.scheme
         self.domain, basis = scheme.domain, polynomial_basis(scheme)
         self.monomials = Monomials(basis.powers.tolist())
-        self.centre = tuple(basis.centre.tolist())  # The middle of the domain
+        self.centre = tuple(scheme.domain.centre.tolist())  # The middle of the domain
         # Coefficients of each function of the scheme's basis, for Stam's form
         self.basis_functions = basis.matrix.T.tolist() if use_stam else None
         self.walk = ElementWalk(table, types)  # Over the table's elements

@@ -117,11 +117,6 @@ class Signature:
     fans: tuple[Fan, ...]
 
     @property
-    def valences(self) -> tuple[int, ...]:
-        """Number of faces at each corner."""
-        return tuple(fan.face_count for fan in self.fans)
-
-    @property
     def sharpness(self) -> float:
         """Largest sharpness of all semi-sharp features; 0 if there are none."""
         return max(max(fan.vertex, *(row[0] for row in (*fan.edges, *fan.across)), 0.0) for fan in self.fans)

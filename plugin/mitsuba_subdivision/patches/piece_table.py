@@ -273,7 +273,7 @@ def _tip(
     u, v = (int(np.flatnonzero((polynomials.powers == power).all(axis=1))[0]) for power in ((1, 0), (0, 1)))
     rest[0, [u, v]], rest[1, [u, v]] = basis.subdominant**level_count * patch.edge_tangents, patch.limit_frame
     # Polynomials are about the middle of the domain, and the extraordinary point is at its corner.
-    rest[0, 0] = polynomials.centre @ rest[0, [u, v]]
+    rest[0, 0] = scheme.domain.centre @ rest[0, [u, v]]
     rest[0, 0, 0] = 1
     blocks, second_eigenvector = [deeper.reshape(shape), rest], 0 * by_level[0, :, :, 0]
     frame = FrameKind.AT_POINT if patch.has_own_frame else FrameKind.DERIVATIVES

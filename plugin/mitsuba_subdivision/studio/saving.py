@@ -6,7 +6,6 @@ import hashlib
 import importlib.util
 import os
 import re
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -16,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage import CageError, CageWarning, ControlCage
+from ..cage import CageError, ControlCage, without_warnings
 from ..cage.contents import RULES, CageContents
 from ..files import ply, usd_stage
 from ..files.formats import write_file
@@ -186,9 +185,8 @@ def _contents(entry: SceneNode) -> CageContents:
     arrays = {key: np.array(entry[key]) for key in _ARRAYS if key in entry}
     rules = {key: entry[key] for key in RULES if key in entry}
     data = read_attributes(entry)
-    with warnings.catch_warnings():
-        # These warnings were issued when the scene was made.
-        warnings.simplefilter("ignore", CageWarning)
+    # Warnings were issued when the scene was made.
+    with without_warnings():
         return ControlCage.from_arrays(**arrays, **rules, **data).contents
 
 
