@@ -59,29 +59,39 @@ def draw_subdivision(options: FigureOptions) -> list[Path]:
     if len(counts) != 1:
         numbers = f"{sorted(counts)} extraordinary points at levels 0 to {LEVELS - 1}"
         raise FigureError(f"{numbers}; expected as many at each")
-    figure, axes = panels(options, *rows_of(options, LEVELS + 1))
-    for axis in axes.flat[LEVELS + 1 :]:
-        axis.set_axis_off()
-    axes, rendered = axes.flat[: LEVELS + 1], []
-    for level, (cage, axis) in enumerate(zip(cages, axes, strict=False)):
+    # Title and caption of each panel, its scene, and lines of some width and points on the surface there.
+    drawn = []
+    for level, cage in enumerate(cages):
         limit = LimitSurface(cage)
         regular = regular_elements(limit)
         share = area_share(limit, regular)
-        scene = staged(stage, mesh=_polyhedron(cage, regular))
         t = cage.topology
         ends = cage.positions[t.face_vertices[[t.edge_half_edge, t.next[t.edge_half_edge]]]]
         along = np.linspace(0, 1, (EDGE_SEGMENTS >> level) + 1)[None, :, None]
         lines = (1 - along) * ends[0][:, None] + along * ends[1][:, None]
         points = np.concatenate([cage.positions[_is_extraordinary(t)], _centres(cage)[t.face_sizes != 4]])
-        width = 0.55 - 0.12 * level
-        rendered.append(_draw_cage(axis, options, f"level {level}", scene, lines, points, width))
-        axis.set(title=f"level {level}", xlabel=f"{100 * share:.{0 if share in (0, 1) else 1}f} % regular")
+        caption = f"{100 * share:.{0 if share in (0, 1) else 1}f} % regular"
+        scene = staged(stage, mesh=_polyhedron(cage, regular))
+        drawn.append((f"level {level}", caption, scene, lines, 0.55 - 0.12 * level, points))
     bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(REGULAR)}}
     scene = staged(stage, surface=limit_surface(limit.cage, RATE, bsdf))
     lines = edge_curves(limit, t.edge_half_edge, EDGE_SEGMENTS >> (LEVELS - 1))
     points = edge_curves(limit, t.vertex_half_edge[_is_extraordinary(t)], 1)[:, 0]
-    rendered.append(_draw_cage(axes[-1], options, "limit surface", scene, lines, points, 0.17))
-    axes[-1].set(title="limit surface", xlabel=f"regular but for {counts.pop()} points")
+    drawn.append(("limit surface", f"regular but for {counts.pop()} points", scene, lines, 0.17, points))
+
+    figure, axes = panels(options, *rows_of(options, len(drawn)))
+    for axis in axes.flat[len(drawn) :]:
+        axis.set_axis_off()
+    rendered, resolution = [], options.resolution
+    for axis, (title, caption, scene, lines, width, points) in zip(axes.flat, drawn, strict=False):
+        rendered.append(render(scene, options, title))
+        show(axis, on_white(rendered[-1]), title, caption)
+        runs = visible_runs(scene, lines, resolution)
+        axis.add_collection(LineCollection(runs, colors="#14181c", linewidths=width, capstyle="round"))
+        seen = project(scene.sensors()[0], points[visible(scene, points)], resolution)
+        axis.plot(*seen.T, "o", color="#d1432b", markersize=2, markeredgecolor="white", markeredgewidth=0.2)
+        # The part of the square image that the surface fills.
+        axis.set(xlim=(0, resolution), ylim=(0.84 * resolution, 0.13 * resolution))
     return write_figure(options, "subdivision", figure, rendered, levels=LEVELS)
 
 
@@ -147,27 +157,6 @@ def edge_curves(
 def _is_extraordinary(topology: Topology) -> NDArray[np.bool_]:
     """``(n_v,)`` whether a vertex inside has another valence than 4."""
     return (topology.vertex_face_count != 4) & ~topology.is_border_vertex
-
-
-def _draw_cage(
-    axis: Axes,
-    options: FigureOptions,
-    name: str,
-    scene: mi.Scene,
-    lines: NDArray[np.floating],
-    points: NDArray[np.floating],
-    width: float,
-) -> NDArray[np.float32]:
-    """Render a scene, and draw the lines and points on its surface that the camera sees; returns the pixels."""
-    pixels, resolution = render(scene, options, name), options.resolution
-    show(axis, on_white(pixels))
-    runs = visible_runs(scene, lines, resolution)
-    axis.add_collection(LineCollection(runs, colors="#14181c", linewidths=width, capstyle="round"))
-    seen = project(scene.sensors()[0], points[visible(scene, points)], resolution)
-    axis.plot(*seen.T, "o", color="#d1432b", markersize=2, markeredgecolor="white", markeredgewidth=0.2)
-    # The part of the square image that the surface fills.
-    axis.set(xlim=(0, resolution), ylim=(0.84 * resolution, 0.13 * resolution))
-    return pixels
 
 
 # Panels of the figure of creases, and their titles.

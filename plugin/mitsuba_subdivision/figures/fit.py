@@ -21,7 +21,7 @@ from ..device_arrays import upload
 from ..fit import CageFit, LargeSteps, Schedule, View
 from ..fit.cage_fit import with_sample_count
 from ..fit.point_fit import mesh_samples
-from ..messages import counted, timed
+from ..messages import counted
 from ..schemes.domain import FloatArray
 from ..shapes.derivatives import loss_of_views
 from ..surface import LimitSurface
@@ -171,9 +171,9 @@ def _views_of(shape: mi.Shape, pixels: int) -> list[View]:
     return views
 
 
-def _is_measured(step: int) -> bool:
-    """Whether the distance to the target is measured after a step: at steps spaced evenly on a logarithmic axis."""
-    return step in {0, *np.rint(np.geomspace(1, STEPS, MEASUREMENTS)).astype(int).tolist()}
+def _measured_steps() -> list[int]:
+    """Steps after which the distance to the target is measured, evenly on a logarithmic axis."""
+    return sorted(set(np.rint(np.geomspace(1, STEPS, MEASUREMENTS)).astype(int).tolist()))
 
 
 def _fit_cage(refine: list[int], views: list[View]) -> Course:
@@ -188,12 +188,10 @@ def _fit_cage(refine: list[int], views: list[View]) -> Course:
         refine=refine,
         spp=SPP,
     )
-    losses, cages = [], {0: fit.cage}
-    for step in counted(range(1, STEPS + 1), "Steps of a cage"):
-        losses.append(fit.step())
-        if _is_measured(step):
-            cages[step] = fit.cage
-    return losses, cages
+    cages = {0: fit.cage}
+    for step in _measured_steps():
+        cages[step] = fit.run(step - len(fit.losses)).cage
+    return fit.losses, cages
 
 
 def _fit_mesh(views: list[View]) -> Course:
@@ -214,7 +212,7 @@ def _fit_mesh(views: list[View]) -> Course:
 
     rate = Schedule.of([(0, MESH_RATES[0]), (STEPS, MESH_RATES[1])], "learning_rate")
     losses, meshes = [], {0: mesh}
-    for step in counted(range(STEPS), "Steps of a dense mesh"):
+    for step in counted(range(STEPS), "Steps"):
         params[key] = large_steps.from_differential(optimizer["u"])
         params.update()
         loss = loss_of_views(scene, params, squared_error, sensors, seed=step, spp=0)
@@ -224,13 +222,12 @@ def _fit_mesh(views: list[View]) -> Course:
         losses.append(float(np.array(loss).item()) / len(views))
         with dr.suspend_grad():
             params[key] = large_steps.from_differential(optimizer["u"])
-        if _is_measured(step + 1):
+        if step + 1 in _measured_steps():
             positions = np.array(params[key], dtype=np.float64).reshape(-1, 3)
             meshes[step + 1] = mesh.with_positions(positions)
     return losses, meshes
 
 
-@timed("Fitting creases")
 def _fit_creases() -> tuple[list[Box], NDArray[np.float64]]:
     """Fit a box; returns target, start and result, and the sharpness of edges after each step, ``(steps + 1, 12)``."""
     edges, z = cube().edges, cube().positions[cube().edges, 2]

@@ -100,13 +100,19 @@ def draw_artifact(options: FigureOptions) -> list[Path]:
     rendered, records = [], []
     for (valence, surface, beside, rate), row_axes in zip(rows, axes, strict=True):
         stage = load_stage(f"valence{5 if options.cage else valence}", resolution=options.resolution)
+        emitters = [shape for shape in stage.shapes() if shape.is_emitter()]
+        bsdf = next(shape.bsdf() for shape in stage.shapes() if not shape.is_emitter())
         for (title, evaluator, is_beside), axis in zip(RULES, row_axes, strict=True):
             offset = beside if is_beside else 0.0
             level, distance, error = vertex_normal(surface, evaluator, offset)
-            location, caption = _caption(offset, level, error)
-            scene = _scene_of(stage, surface, rate, evaluator, offset)
+            location = "u = v = 0" if level is None else f"u = v = {scientific(offset)}, n = {level}"
+            shown_error = f"{'below ' * (error < NEGLIGIBLE)}{scientific(max(error, NEGLIGIBLE))}°"
+            if error >= 0.1:
+                shown_error = f"{error:.1f}°"
+            sampling = {"scheme": options.scheme, "evaluator": evaluator, "sample_offset": offset}
+            scene = staged(stage, emitters, surface=limit_surface(surface.cage, rate, bsdf, **sampling))
             rendered.append(render(scene, options, f"valence {valence}, {title}")[..., :3])
-            show(axis, in_8_bits(rendered[-1]), caption=f"{location}\n{caption}")
+            show(axis, in_8_bits(rendered[-1]), caption=f"{location}\nerror {shown_error}")
             _draw_lines(axis, scene, surface, surface.tessellate(rate, evaluator, np.float32, offset))
             record = {"valence": valence, "rule": title, "level": level, "offset": distance, "error": error}
             records.append(record)
@@ -129,22 +135,6 @@ def _rows_of_user(path: Path, scheme: str) -> list[tuple[int, LimitSurface, floa
         level = np.log(LOST) / np.log(subdominant)
         rows.append((valence, LimitSurface(cage, scheme), float(f"{0.5**level:.0e}"), rate))
     return rows
-
-
-def _caption(sample_offset: float, level: int | None, error: float) -> tuple[str, str]:
-    """Label with the sample location of the vertex and the error of its normal."""
-    location = "u = v = 0" if level is None else f"u = v = {scientific(sample_offset)}, n = {level}"
-    if error >= 0.1:
-        return location, f"error {error:.1f}°"
-    return location, f"error {'below ' * (error < NEGLIGIBLE)}{scientific(max(error, NEGLIGIBLE))}°"
-
-
-def _scene_of(stage: mi.Scene, surface: LimitSurface, rate: int, evaluator: Evaluator, offset: float) -> mi.Scene:
-    """The scene, with a surface in place of its own."""
-    emitters = [shape for shape in stage.shapes() if shape.is_emitter()]
-    bsdf = next(shape.bsdf() for shape in stage.shapes() if not shape.is_emitter())
-    sampling = {"scheme": surface.scheme.name, "evaluator": evaluator, "sample_offset": offset}
-    return staged(stage, emitters, surface=limit_surface(surface.cage, rate, bsdf, **sampling))
 
 
 def _draw_lines(axis: Axes, scene: mi.Scene, surface: LimitSurface, tessellation: Tessellation) -> None:
