@@ -156,7 +156,18 @@ def _render(options: argparse.Namespace) -> None:
         options.filter = BOX
     set_variant(options.variant)
     with _settings(options):
-        (_render_model if is_model else _render_scene)(options, by_passes)
+        if options.scene.is_file() and not options.frames:
+            require_writable(options.output, [options.scene])
+        elif is_model and not options.frames:
+            hint = ", or --frames for a name of several files" if "%" in options.scene.name else ""
+            raise FileNotFoundError(f'"{options.scene}": there is no such file; expected a model{hint}')
+        if by_passes:
+            _render_by_passes(options, is_model)
+        elif options.frames or options.turntable:
+            _write_frames(options)
+        else:
+            image = next(_pictures(options, [1]))[1] if is_model else _picture_of_scene(options)
+            _write_image(options, image, options.output)
 
 
 def _require_effect(options: argparse.Namespace, is_model: bool) -> None:
@@ -229,34 +240,14 @@ def _settings(options: argparse.Namespace) -> Iterator[None]:
             mi.set_log_level(level)
 
 
-def _render_scene(options: argparse.Namespace, by_passes: bool) -> None:
-    if options.scene.is_file():  # Otherwise loading refuses the scene, before a folder is made.
-        require_writable(options.output, [options.scene])
-    if by_passes:
-        _render_by_passes(options)
-        return
+def _picture_of_scene(options: argparse.Namespace) -> NDArray[np.float32]:
     loaded = load_scene(options.scene, dict(options.parameters), options.filter, options.sensor or 0)
     require_writable(options.output, loaded.file_paths)
     if loaded.scene.integrator() is None:  # Mitsuba would raise a bare Exception.
         raise ValueError(f'scene "{options.scene}" has no integrator; expected one')
     if options.output.suffix.lower() != ".exr" and loaded.scene.integrator().aov_names():
         raise ValueError(f'output "{options.output}"; expected a name ending in .exr, as the integrator has AOVs')
-    _write_image(options, _render_picture(options, [loaded], options.spp), options.output)
-
-
-def _render_model(options: argparse.Namespace, by_passes: bool) -> None:
-    if not options.frames:
-        if not options.scene.is_file():
-            hint = ", or --frames for a name of several files" if "%" in options.scene.name else ""
-            raise FileNotFoundError(f'"{options.scene}": there is no such file; expected a model{hint}')
-        require_writable(options.output, [options.scene])
-    if by_passes:
-        _render_by_passes(options, is_model=True)
-    elif options.frames or options.turntable:
-        _write_frames(options)
-    else:
-        _, image = next(_pictures(options, [1]))
-        _write_image(options, image, options.output)
+    return _render_picture(options, [loaded], options.spp)
 
 
 def _write_frames(options: argparse.Namespace) -> None:
@@ -319,7 +310,7 @@ def _pictures(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[t
     return ((number, _render_picture(options, islice(scenes, options.shutter or 1))) for number in numbers)
 
 
-def _render_by_passes(options: argparse.Namespace, *, is_model: bool = False) -> None:
+def _render_by_passes(options: argparse.Namespace, is_model: bool) -> None:
     """Render by passes, in the current variant, here or on a cluster, and write the image."""
     from ..regression import renders
     from ..regression.image import save_image

@@ -30,7 +30,6 @@ _RGB = ("R", "G", "B")
 _PROBE = {"position": ("P.X", "P.Y", "P.Z"), "normal": ("Ns.X", "Ns.Y", "Ns.Z"), "uv": ("uv.U", "uv.V")}
 _PROBE |= {"shape": ("shape",), "triangle": ("prim",), "element": ("element",)}
 _MAGIC = b"\x76\x2f\x31\x01"
-_LONGEST = 60
 _quieting = threading.Lock()
 
 
@@ -278,9 +277,8 @@ def _require_metadata(metadata: dict[str, Any], source: str) -> None:
     }
     for name, (is_right, expected) in forms.items():
         if name in metadata and not is_right(metadata[name]):
-            text = str(metadata[name])
-            shown = text[:_LONGEST] + ".." * (len(text) > _LONGEST)
-            raise RegressionError(f'metadata of image "{source}": {name} is {shown}; expected {expected}')
+            given = str(metadata[name])
+            raise RegressionError(f'metadata of image "{source}": {name} is {given:.60}; expected {expected}')
 
 
 def write_exr(path: str | Path, pixels: NDArray[np.floating], metadata: dict | None = None) -> None:
