@@ -81,9 +81,13 @@ def primvar(name, kind, value, interpolation, count, indices=""):
     return f"{values}\n{indices}"
 
 
+KINDS = {"displayColor": ("color3f", "(1, 0, 0)"), "tint": ("color3f", "(1, 0, 0)"), "st": ("texCoord2f", "(0, 1)")}
+KINDS["normals"] = "normal3f", "(0, 0, 1)"
+
+
 def primvars():
-    kinds = {"displayColor": ("color3f", "(1, 0, 0)"), "tint": ("color3f", "(1, 0, 0)"), "st": ("texCoord2f", "(0, 1)")}
-    for name, (kind, value) in kinds.items():
+    """Normals are those of polygons, and may be an attribute that is no primvar."""
+    for name, (kind, value) in KINDS.items():
         for interpolation, count in COUNT.items():
             if interpolation == "constant" and name == "st":
                 continue
@@ -98,33 +102,21 @@ def primvars():
                 yield name, primvar(name, kind, value, interpolation, count - 1)
                 yield name, primvar(name, kind, value, interpolation, 2, where)
                 yield name, primvar(name, kind, value, interpolation, 2, f'string[] primvars:{name}:indices = ["a"]')
+            if name == "normals":
+                yield name, primvar(name, kind, value, interpolation, count + 1).replace("primvars:", "")
         yield name, primvar(name, kind, value, "elsewhere", 8)
         # Without an interpolation, it is constant.
-        if name != "st":
+        if name in ("displayColor", "tint"):
             yield name, f"{kind}[] primvars:{name} = [{value}, {value}, {value}]"
     yield "st", primvar("st", "float3", "(0, 1, 0)", "vertex", 8)
-
-
-def normals():
-    up = partial(primvar, "normals", "normal3f")
-    for interpolation, count in COUNT.items():
-        for number in (count - 1, count + 1):
-            if number:
-                yield up("(0, 0, 1)", interpolation, number).replace("primvars:", "")
-        for wrong in ("99", "-1"):
-            where = f"int[] primvars:normals:indices = [{', '.join([wrong] * count)}]"
-            yield up("(0, 0, 1)", interpolation, 2, where)
-    yield up("(0, 0, nan)", "vertex", 8).replace("primvars:", "")
-    yield up("(0, 0, 1)", "elsewhere", 8).replace("primvars:", "")
-    yield primvar("normals", "float2", "(0, 1)", "vertex", 8).replace("primvars:", "")
-    yield 'string[] normals = ["a"] ( interpolation = "vertex" )'
+    yield "normals", primvar("normals", "float2", "(0, 1)", "vertex", 8).replace("primvars:", "")
+    yield "normals", 'string[] normals = ["a"] ( interpolation = "vertex" )'
 
 
 UNFIT = [
     *((name, body) for name, bodies in TAGS.items() for body in bodies),
     *((body.split()[2], body) for body in TOKENS),
-    *primvars(),
-    *(("normals", POLYGONS + body) for body in normals()),
+    *((name, POLYGONS * (name == "normals") + body) for name, body in primvars()),
     *(("part", subset(faces)) for faces in ("[6]", "[-1]")),
     ("part", subset('["a"]').replace("int[]", "string[]")),
 ]
