@@ -16,6 +16,7 @@ from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.files.formats import FORMATS, Format, write_triangles
 from patches.closed_cages import tetrahedron
 from reference.refined_cages import tagged
+from usd import stages
 
 USD = (".usd", ".usda", ".usdc")
 
@@ -326,18 +327,14 @@ def test_command(tmp_path, capsys):
 
 def test_command_chooses_scheme_mesh_and_time(tmp_path, capsys):
     pytest.importorskip("pxr")
-    from pxr import Usd, UsdGeom
-
-    path = tmp_path / "cages.usda"
-    stage = Usd.Stage.CreateNew(str(path))
-    for name, cage in (("cube", cube()), ("tetrahedron", tetrahedron())):
-        mesh = UsdGeom.Mesh.Define(stage, f"/{name}")
-        for time in (1, 2):
-            mesh.CreatePointsAttr().Set((time * cage.positions).astype(np.float32), time)
-        mesh.CreateFaceVertexCountsAttr(cage.face_sizes.astype(np.int32))
-        mesh.CreateFaceVertexIndicesAttr(cage.face_vertices.astype(np.int32))
-    mesh.CreateSubdivisionSchemeAttr("loop")
-    stage.Save()
+    text = ""
+    for name, cage, scheme in (("cube", cube(), "catmullClark"), ("tetrahedron", tetrahedron(), "loop")):
+        points = {time: [*map(tuple, (time * cage.positions).tolist())] for time in (1, 2)}
+        statements = {"point3f[] points": points, "uniform token subdivisionScheme": f'"{scheme}"'}
+        statements["int[] faceVertexCounts"] = cage.face_sizes.tolist()
+        statements["int[] faceVertexIndices"] = cage.face_vertices.tolist()
+        text += stages.prim("Mesh", name, *(stages.stated(*row) for row in statements.items()))
+    path = stages.write(tmp_path, text, "cages.usda")
     words = ["tessellate", str(path), "-o", str(tmp_path / "out.ply"), "--rate", "2"]
     assert main(words) == 1
     assert "there are 2 meshes; expected prim to name one of /cube, /tetrahedron" in capsys.readouterr().err
