@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from xml.etree import ElementTree
 
 # Before Mitsuba, so that Dr.Jit finds an LLVM library that works.
 import mitsuba_subdivision  # noqa: F401
@@ -43,31 +44,30 @@ XYZ = np.array([[0.412453, 0.357580, 0.180423], [0.212671, 0.715160, 0.072169], 
 IDIFF = ["idiff", "-q", "-fail", "0.05", "-failpercent", "1"]
 
 FOLDER = Path(__file__).parent / "data" / "comparison"
-# Of each scene, where its camera is and looks to, and parameters that an albedo changes.
-CAMERAS = {
-    "balls": ([0, -7, 3.5], [0, 0, 0.5]),
-    "caustics": ([0, -6, 4], [0, 0, 0.3]),
-    "room": ([-0.1, -0.98, 0.1], [-0.1, 1, -0.3]),
-    "fog": ([0, -5, 1.5], [0, 0, 0.5]),
-}
-ALBEDOS = {
-    "balls": {"board": [0.6], "cube": [0.6, 0.3, 0.2]},
-    "caustics": {"floor": [0.5] * 3},
-    "room": {"walls": [0.6] * 3},
-    "fog": {"floor": [0.4] * 3, "ball": [0.5]},
-}
+# These have cameras and albedos of their own.
+IN_FOLDER = ("balls", "caustics", "room", "fog")
+# What the camera looks to, and from where.
+PLACES = ("default[@name='target']", "value"), (".//lookat", "origin")
 
 
 def made(name: str, albedo: float = 1.0, shift: float = 0.0) -> LoadedScene:
     """A scene with other albedos, whose camera is turned to the right by a part of a pixel."""
     if name == "valence5":
         return load_scene(valence5(albedo, shift))
-    origin, target = map(np.array, CAMERAS[name])
-    right = np.cross(target - origin, [0, 0, 1])
-    target = target + right / np.linalg.norm(right) * np.linalg.norm(target - origin) * shift * PIXEL
-    values = {key: albedo * np.array(value) for key, value in ALBEDOS[name].items()} | {"target": target}
+    file = FOLDER / f"{name}.xml"
+    root = ElementTree.parse(file)
+
+    def numbers(text: str) -> np.ndarray:
+        return np.array(text.split(","), dtype=float)
+
+    # Parameters of these scenes are albedos, and the point that the camera looks to.
+    values = {entry.attrib["name"]: albedo * numbers(entry.attrib["value"]) for entry in root.iter("default")}
+    target, origin = (numbers(root.find(path).attrib[key]) for path, key in PLACES)
+    ahead = target - origin
+    right = np.cross(ahead, [0, 0, 1])
+    values["target"] = target + right / np.linalg.norm(right) * np.linalg.norm(ahead) * shift * PIXEL
     words = {key: ", ".join(map(repr, value.tolist())) for key, value in values.items()}
-    return load_scene(FOLDER / f"{name}.xml", words, "box")
+    return load_scene(file, words, "box")
 
 
 def valence5(albedo: float, shift: float) -> mi.Scene:
@@ -84,7 +84,7 @@ def valence5(albedo: float, shift: float) -> mi.Scene:
     return loaded
 
 
-SCENES = [*CAMERAS, "valence5"]
+SCENES = [*IN_FOLDER, "valence5"]
 CHANGES: dict[str, dict[str, float]] = {"unchanged": {}}
 CHANGES |= {f"albedo + {part:g} %": {"albedo": 1 + part / 100} for part in (0.1, 1, 4)}
 CHANGES |= {f"camera {part:g} px": {"shift": part} for part in (0.05, 0.5)}
