@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,9 +11,14 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import mitsuba as mi
+import numpy as np
 import pytest
+from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision import whole_file as module
+from mitsuba_subdivision.regression.image import write_exr
 from mitsuba_subdivision.whole_file import remove_unfinished, require_folder, require_writable, whole_file
+from patches.closed_cages import torus
 
 # The module alone: what a process imports besides takes a second.
 WRITER = f"""
@@ -190,47 +196,43 @@ def test_inputs_are_refused_as_outputs(tmp_path):
     assert names(tmp_path / "new") == []
 
 
-FULL = """
-import resource, sys
-import numpy as np
-from pathlib import Path
-import mitsuba_subdivision as msub
-import mitsuba as mi
-from patches.closed_cages import torus
-from mitsuba_subdivision.figures.staging import draw_picture
-from mitsuba_subdivision.figures.output import FigureOptions
-from mitsuba_subdivision.regression.image import write_exr
-from mitsuba_subdivision.whole_file import whole_file
-mi.set_variant("scalar_rgb")
-folder = Path(sys.argv[1])
-pixels = np.random.default_rng(0).random((128, 128, 3)).astype(np.float32)
-cage = torus(20, 20)
-triangles = msub.LimitSurface(cage).tessellate(8)
-def bitmap(path):
-    with whole_file(path) as beside:
-        mi.util.convert_to_bitmap(pixels, uint8_srgb=False).write(str(beside))
-writers = {"a.exr": lambda path: write_exr(path, pixels), "b.exr": bitmap, "b.hdr": bitmap,
-    "c.png": lambda path: draw_picture(FigureOptions(folder, formats=("png",)), "c", pixels)}
-writers |= {f"d.{s}": triangles.save for s in ("obj", "ply", "usda", "usdc")}
-writers |= {f"e.{s}": cage.save for s in ("obj", "ply", "usda", "usdc")}
-# As on a full disk: what goes beyond is not written.
-resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
-for name, write in writers.items():
-    path = folder / name
-    path.write_text("old")
-    try:
-        write(path)
-    except OSError as error:
-        print(name, path.read_text(), len(list(folder.iterdir())), str(path) in str(error), ".part" in str(error))
-    path.unlink()
-"""
-
-
 @pytest.mark.posix
-def test_every_writer_tells_of_a_full_disk_and_leaves_what_was_there(tmp_path):
+@pytest.mark.usefixtures("variant_scalar_rgb")
+def test_every_writer_tells_of_a_full_disk_and_leaves_what_was_there(tmp_path, np_rng):
+    resource = pytest.importorskip("resource")
     for package in ("pxr", "plyfile", "matplotlib"):
         pytest.importorskip(package)
-    command, environment = [sys.executable, "-c", FULL, str(tmp_path)], {"PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env={**os.environ, **environment})
-    kinds = ["a.exr", "b.exr", "b.hdr", "c.png", *(f"{c}.{s}" for c in "de" for s in ("obj", "ply", "usda", "usdc"))]
-    assert done.stdout.splitlines() == [f"{name} old 1 True False" for name in kinds], done.stderr
+    from mitsuba_subdivision.figures.output import FigureOptions
+    from mitsuba_subdivision.figures.staging import draw_picture
+
+    pixels, cage = np_rng.random((128, 128, 3)).astype(np.float32), torus(20, 20)
+
+    def write_bitmap(path):
+        with whole_file(path) as beside:
+            mi.util.convert_to_bitmap(pixels, uint8_srgb=False).write(str(beside))
+
+    def draw(path):
+        draw_picture(FigureOptions(tmp_path, formats=("png",)), path.stem, pixels)
+
+    writers = {
+        "a.exr": lambda path: write_exr(path, pixels),
+        "b.exr": write_bitmap,
+        "b.hdr": write_bitmap,
+        "c.png": draw,
+    }
+    writers |= {f"d.{suffix}": LimitSurface(cage).tessellate(2).save for suffix in ("obj", "ply", "usda", "usdc")}
+    writers |= {f"e.{suffix}": cage.save for suffix in ("obj", "ply", "usda", "usdc")}
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # As on a full disk: what goes beyond is not written.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        for name, writer in writers.items():
+            (tmp_path / name).write_text("old")
+            with pytest.raises(OSError, match=re.escape(str(tmp_path / name))) as error:
+                writer(tmp_path / name)
+            assert ".part" not in str(error.value)
+            assert names(tmp_path) == [name]
+            assert (tmp_path / name).read_text() == "old"
+            (tmp_path / name).unlink()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
