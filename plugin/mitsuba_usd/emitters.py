@@ -24,8 +24,8 @@ _LEAST_SOFTNESS = 1e-3
 
 def emitter(light: LightContents, textures: Textures) -> SceneNode:
     """An emitter, or a shape with one."""
-    if light.kind in ("dome", "rect"):
-        return _dome(light, textures) if light.kind == "dome" else _rect(light, textures)
+    if light.kind in _MAYBE_TEXTURED:
+        return _MAYBE_TEXTURED[light.kind](light, textures)
     return _MAKERS[light.kind](light)
 
 
@@ -40,23 +40,18 @@ def _distant(light: LightContents) -> SceneNode:
     return {"type": "directional", "direction": direction.tolist(), "irradiance": rgb(irradiance)}
 
 
-def _rect(light: LightContents, textures: Textures) -> SceneNode:
-    width, height = light.size
-    area = _area(light, width * height * _stretch(light.to_world, 0, 1))
+def _flat(light: LightContents, textures: Textures) -> SceneNode:
+    """A rectangle or a disk."""
+    is_rect = light.kind == "rect"
+    u, v = np.array(light.size) / 2 if is_rect else np.repeat(light.size, 2)
+    area = _area(light, (4 if is_rect else math.pi) * u * v * _stretch(light.to_world, 0, 1))
     bitmap = None if light.texture is None else textures.radiance(light.texture, area["radiance"]["value"])
     if bitmap is not None:
         # The image is upright for a viewer that looks at the light.
         upright = mi.ScalarAffineTransform3f([[1, 0, 0], [0, -1, 1], [0, 0, 1]])
         area["radiance"] = {"type": "bitmap", "bitmap": bitmap, "to_uv": upright, "wrap_mode": "clamp"}
-    matrix = light.to_world @ _TURNED @ np.diag([width / 2, height / 2, 1, 1])
-    return {"type": "rectangle", "to_world": mi.ScalarTransform4f(matrix.tolist()), "emitter": area}
-
-
-def _disk(light: LightContents) -> SceneNode:
-    radius = light.size[0]
-    matrix = light.to_world @ _TURNED @ np.diag([radius, radius, 1, 1])
-    area = math.pi * radius**2 * _stretch(light.to_world, 0, 1)
-    return {"type": "disk", "to_world": mi.ScalarTransform4f(matrix.tolist()), "emitter": _area(light, area)}
+    to_world = mi.ScalarTransform4f((light.to_world @ _TURNED @ np.diag([u, v, 1, 1])).tolist())
+    return {"type": "rectangle" if is_rect else "disk", "to_world": to_world, "emitter": area}
 
 
 def _sphere(light: LightContents) -> SceneNode:
@@ -102,14 +97,8 @@ def _dome(light: LightContents, textures: Textures) -> SceneNode:
     return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(turned.tolist())}
 
 
-_MAKERS = {
-    "distant": _distant,
-    "disk": _disk,
-    "sphere": _sphere,
-    "point": _point,
-    "spot": _spot,
-    "cylinder": _cylinder,
-}
+_MAYBE_TEXTURED = {"rect": _flat, "disk": _flat, "dome": _dome}
+_MAKERS = {"distant": _distant, "sphere": _sphere, "point": _point, "spot": _spot, "cylinder": _cylinder}
 
 
 def one_environment(lights: list[LightContents], notes: StageWarnings) -> list[LightContents]:

@@ -32,10 +32,6 @@ _TYPES = {
 
 # Files that other renderers' shaders are in are left: only definitions and graphs are read.
 _FOLDERS = ("stdlib", "pbrlib", "bxdf", "cmlib", "nprlib")
-# What is said where the package is missing.
-MISSING = (
-    'MaterialX materials are ignored, as the package materialx is missing; pip install "mitsuba-subdivision[files]"'
-)
 
 
 def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:

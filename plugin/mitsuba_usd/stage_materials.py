@@ -15,10 +15,10 @@ from pxr import Usd, UsdShade
 
 from . import surface_models
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, TextureContents, leaves
-from .materialx_layers import MISSING, has_materialx, library, numbers
-from .materialx_nodes import CHANNELS, OPERATIONS, SAMPLED, constant, evaluate, is_constant, node, node_of
+from .materialx_layers import has_materialx, library, numbers
+from .materialx_nodes import CHANNELS, OPERATIONS, SAMPLED, constant, evaluate, is_all, is_constant, node, node_of
 from .stage_warnings import StageWarnings
-from .surface_models import LEFT_OUT, MODELS, PREVIEW, left_out
+from .surface_models import LEFT_OUT, MODELS, PREVIEW
 from .texture_image import UDIM
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ class MaterialReader:
         if material.ComputeVolumeSource()[0]:
             self._notes.add("volumes of materials are ignored", path)
         model, inputs = read
-        names = left_out(model, inputs)
+        names = [name for name in LEFT_OUT[model] if not is_all(inputs.get(name, 0.0), 0)]
         if names:
             self._notes.add(f"inputs of {model} that Mitsuba's BSDFs lack are ignored", f"{', '.join(names)} of {path}")
         if any(inputs.get(name, 0.0) != 0 for name in ("subsurface", "subsurface_weight")):
@@ -138,7 +138,8 @@ class MaterialReader:
         elif not name.startswith("ND_") or not any(f"_{known}_" in name for known in MODELS):
             return None
         elif not has_materialx():
-            self._notes.add(MISSING, shader.GetPath())
+            what = "MaterialX materials are ignored, as the package materialx is missing"
+            self._notes.add(f'{what}; pip install "mitsuba-subdivision[files]"', shader.GetPath())
             return None
         else:
             definition = library().getNodeDef(name)

@@ -20,7 +20,7 @@ from mitsuba_subdivision.messages import timed
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel
 
-from .contents import CameraContents, InstanceContents, SceneContents
+from .contents import CameraContents, InstanceContents, MaterialContents, SceneContents
 from .materialx_layers import with_documents
 from .stage_lights_and_camera import read_camera, read_light, read_settings
 from .stage_materials import MaterialReader
@@ -231,11 +231,11 @@ class _StageWalk:
         is_hidden = UsdGeom.Imageable(prim) and UsdGeom.Imageable(prim).ComputePurpose() in files.HIDDEN_PURPOSES
         key = str(prim.GetPrototype().GetPath()), self._bindings(prim), bool(is_hidden)
         if key not in self._inherited:
-            parts = list(_parts(prim))
             names: set[str] = set()
-            for material in {self._materials.bound(part) for part in parts if _is_shape(part)}:
+            for material in set(self._materials_below(prim)):
                 names.update(COLORS if material is None else material.primvars())
-            is_placed = any(UsdGeom.Xformable(part) and UsdGeom.Xformable(part).GetResetXformStack() for part in parts)
+            places = map(UsdGeom.Xformable, _parts(prim))
+            is_placed = any(place and place.GetResetXformStack() for place in places)
             self._inherited[key] = sorted(names), is_placed
         names_read, is_placed = self._inherited[key]
         primvars = [UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name) for name in names_read]
@@ -249,13 +249,18 @@ class _StageWalk:
         """Bindings of materials that an instance inherits or has; of collections, the materials of its parts."""
         above = (self._stage.GetPrimAtPath(path) for path in prim.GetPath().GetPrefixes())
         if any(ancestor.GetPropertiesInNamespace("material:binding:collection") for ancestor in above):
-            return tuple(self._materials.bound(part) for part in _parts(prim) if _is_shape(part))
+            return tuple(self._materials_below(prim))
         bindings = []
         for purpose in (UsdShade.Tokens.allPurpose, UsdShade.Tokens.full, UsdShade.Tokens.preview):
             material, binding = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)
             strength = UsdShade.MaterialBindingAPI.GetMaterialBindingStrength(binding) if binding else ""
             bindings.append((str(material.GetPath()), binding.GetName() if binding else "", strength))
         return tuple(bindings)
+
+    def _materials_below(self, prim: Usd.Prim) -> list[MaterialContents | None]:
+        """Materials of all that an instance shows."""
+        shapes = (part for part in _parts(prim) if part.IsA(UsdGeom.Gprim) or part.IsA(UsdGeom.Subset))
+        return [self._materials.bound(part) for part in shapes]
 
     def _point_instances(
         self, instancer: UsdGeom.PointInstancer, name: str, to_root: NDArray[np.float64]
@@ -356,8 +361,3 @@ def _can_be_instanced(prototype: SceneContents) -> bool:
 def _parts(root: Usd.Prim) -> Usd.PrimRange:
     """A prim and its descendants, those of instances among them."""
     return Usd.PrimRange(root, Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded))
-
-
-def _is_shape(prim: Usd.Prim) -> bool:
-    """Whether a material may be bound to what a prim shows."""
-    return bool(prim.IsA(UsdGeom.Gprim) or prim.IsA(UsdGeom.Subset))

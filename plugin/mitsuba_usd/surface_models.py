@@ -57,12 +57,6 @@ def material(name: str, model: str, given: Mapping[str, Input]) -> MaterialConte
     return MaterialContents(name, inputs if is_constant(normal) else {**inputs, "normal": normal})
 
 
-def left_out(model: str, given: Mapping[str, Input]) -> list[str]:
-    """Inputs of a material that have no place in `NEUTRAL` and are not neutral."""
-    neutral = {"transmission_scatter": BLACK}
-    return [name for name in LEFT_OUT[model] if name in given and given[name] != neutral.get(name, 0.0)]
-
-
 def standard_surface(i: Given) -> dict[str, Input]:
     """Autodesk Standard Surface."""
     coat = i("coat")
