@@ -20,7 +20,7 @@ from patches.closed_cages import cube_with_hexagon, tetrahedron, torus
 import numpy as np
 import pytest
 from mitsuba_subdivision.cage import ControlCage, named_cages
-from mitsuba_subdivision.llvm import llvm_problem
+from mitsuba_subdivision.variants import variant_problem
 
 
 ALL_THREADS = dr.thread_count()
@@ -118,29 +118,15 @@ def obj_file(tmp_path):
     return write
 
 
-def _missing(variant: str) -> str | None:
-    """Why a variant cannot run here, None if it can."""
-    if variant not in mi.variants():
-        return "Mitsuba was compiled without it"
-    backend = variant.partition("_")[0]
-    if backend in ("scalar", "llvm"):
-        return llvm_problem() if backend == "llvm" else None
-    return None if dr.has_backend(getattr(dr.JitBackend, {"cuda": "CUDA"}.get(backend, "Metal"))) else "no such device"
-
-
 _COMPILED = list(mi.variants())
 _RGB = [v for v in _COMPILED if v.endswith("_rgb")]
-_GROUPS = {
-    "all": _COMPILED,
-    "all_rgb": _RGB,
-    "array_rgb": [v for v in _RGB if not v.startswith("scalar")],
-    "all_ad_rgb": [v for v in _RGB if v.endswith("_ad_rgb")],
-}
+_GROUPS = {"all": _COMPILED, "all_rgb": _RGB, "array_rgb": [v for v in _RGB if not v.startswith("scalar")]}
+_GROUPS["all_ad_rgb"] = [v for v in _RGB if v.endswith("_ad_rgb")]
 
 
 def _in_variant(variant: str):
-    if reason := _missing(variant):
-        pytest.skip(f"{variant}: {reason}")
+    if reason := variant_problem(variant):
+        pytest.skip(reason)
     mi.set_variant(variant)
     yield variant
     if not variant.startswith("scalar"):

@@ -1,6 +1,7 @@
 """The same work by OpenSubdiv and Embree, where their development files are installed."""
 
 import json
+import shutil
 import signal
 import subprocess
 from pathlib import Path
@@ -19,18 +20,16 @@ def built_peers(folder):
     """By name of a peer, the command of what can be built, and why others are missing."""
     commands, absent = {}, {}
     for name, (source, libraries, first) in PROGRAMS.items():
-        program = Path(folder) / source
-        sources = [HERE / f"{source}.cpp", HERE / "peer_timing.h"]
+        program, sources = Path(folder) / source, [HERE / f"{source}.cpp", HERE / "peer_timing.h"]
         if not program.exists() or program.stat().st_mtime < max(path.stat().st_mtime for path in sources):
             program.parent.mkdir(parents=True, exist_ok=True)
             command = ["c++", *FLAGS, str(sources[0]), "-o", str(program), *libraries, "-lpthread"]
-            try:
-                subprocess.run(command, check=True, capture_output=True, text=True)
-            except FileNotFoundError:
+            if shutil.which("c++") is None:
                 absent[name] = "there is no C++ compiler"
                 continue
-            except subprocess.CalledProcessError as error:
-                absent[name] = next((line for line in error.stderr.splitlines() if "error" in line), "did not compile")
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            if done.returncode:
+                absent[name] = next((line for line in done.stderr.splitlines() if "error" in line), "did not compile")
                 continue
         commands[name] = [str(program), *first]
     return commands, absent

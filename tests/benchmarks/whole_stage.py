@@ -45,7 +45,7 @@ def main():
     reason = _no_cycles(options.cycles)
     if reason:
         print(f"Cycles: left out, {reason}")
-    _show(_best(options, [*SHADINGS, "cycles"][: 2 if reason else 3]))
+    _show(_best(options, SHADINGS if reason else (*SHADINGS, "cycles")))
 
 
 def without_materials(path, copy):

@@ -139,7 +139,7 @@ def test_rare_events_are_no_alarm_and_changes_beside_them_are_seen(rate):
 def test_tiles_at_the_edge_end_with_the_picture():
     """30 by 30 pixels are no multiple of the tiles' sides."""
     mean, nothing = truth()[:30, :30], {"paired": None, "probe": None}
-    reference, test = (images(seed, 1, 16, mean=seed * mean, **nothing)[0] for seed in (2, 3))
+    reference, test = (images(seed, 1, 16, mean=seed / 2 * mean, **nothing)[0] for seed in (2, 3))
     failing = compare(reference, test, ["tile"]).tiers[0].numbers["failing"]
     ends = np.array([(tile["x"] + tile["width"], tile["y"] + tile["height"]) for tile in failing])
     assert (ends.max(axis=0) == 30).all()
