@@ -18,24 +18,8 @@ from ..evaluation.patch_tree import lattice_stencils
 from ..mesh.connectivity import Topology
 from ..surface import LimitSurface
 from ..variants import SceneNode
+from . import staging
 from .output import FigureError, FigureOptions, panels, rows_of, show, write_figure
-from .staging import (
-    edge_rods,
-    fitted,
-    in_ball,
-    limit_surface,
-    load_stage,
-    make_mesh,
-    on_white,
-    paint,
-    project,
-    read,
-    render,
-    render_panels,
-    staged,
-    visible,
-    visible_runs,
-)
 
 LEVELS = 4
 # Of the ball that fills the picture, for cages of users.
@@ -49,10 +33,10 @@ RATE = 6
 
 def draw_subdivision(options: FigureOptions) -> list[Path]:
     """Draw a cage of 3-, 4-, 5- and 6-gons at levels 0 to 3, its irregular patches grey, and its limit surface."""
-    stage = load_stage("subdivision", resolution=options.resolution)
+    stage = staging.load_stage("subdivision", resolution=options.resolution)
     cages = [ControlCage.from_file(example_file("cages/propeller.obj"))]
     if options.cage:
-        cages = [in_ball(read(options.cage), RADIUS)]
+        cages = [staging.in_ball(staging.read(options.cage), RADIUS)]
     while len(cages) < LEVELS:
         cages.append(cages[-1].refined())
     counts = {extraordinary_count(cage.topology) for cage in cages}
@@ -71,10 +55,10 @@ def draw_subdivision(options: FigureOptions) -> list[Path]:
         lines = (1 - along) * ends[0][:, None] + along * ends[1][:, None]
         points = np.concatenate([cage.positions[_is_extraordinary(t)], _centres(cage)[t.face_sizes != 4]])
         caption = f"{100 * share:.{0 if share in (0, 1) else 1}f} % regular"
-        scene = staged(stage, mesh=_polyhedron(cage, regular))
+        scene = staging.staged(stage, mesh=_polyhedron(cage, regular))
         drawn.append((f"level {level}", caption, scene, lines, 0.55 - 0.12 * level, points))
     bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(REGULAR)}}
-    scene = staged(stage, surface=limit_surface(limit.cage, RATE, bsdf))
+    scene = staging.staged(stage, surface=staging.limit_surface(limit.cage, RATE, bsdf))
     lines = edge_curves(limit, t.edge_half_edge, EDGE_SEGMENTS >> (LEVELS - 1))
     points = edge_curves(limit, t.vertex_half_edge[_is_extraordinary(t)], 1)[:, 0]
     drawn.append(("limit surface", f"regular but for {counts.pop()} points", scene, lines, 0.17, points))
@@ -84,11 +68,11 @@ def draw_subdivision(options: FigureOptions) -> list[Path]:
         axis.set_axis_off()
     rendered, resolution = [], options.resolution
     for axis, (title, caption, scene, lines, width, points) in zip(axes.flat, drawn, strict=False):
-        rendered.append(render(scene, options, title))
-        show(axis, on_white(rendered[-1]), title, caption)
-        runs = visible_runs(scene, lines, resolution)
+        rendered.append(staging.render(scene, options, title))
+        show(axis, staging.on_white(rendered[-1]), title, caption)
+        runs = staging.visible_runs(scene, lines, resolution)
         axis.add_collection(LineCollection(runs, colors="#14181c", linewidths=width, capstyle="round"))
-        seen = project(scene.sensors()[0], points[visible(scene, points)], resolution)
+        seen = staging.project(scene.sensors()[0], points[staging.visible(scene, points)], resolution)
         axis.plot(*seen.T, "o", color="#d1432b", markersize=2, markeredgecolor="white", markeredgewidth=0.2)
         # The part of the square image that the surface fills.
         axis.set(xlim=(0, resolution), ylim=(0.84 * resolution, 0.13 * resolution))
@@ -127,7 +111,7 @@ def _polyhedron(cage: ControlCage, regular: NDArray[np.bool_]) -> mi.Mesh:
     normals = np.add.reduceat(cross, t.face_offsets[:-1])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     half_edges = np.arange(t.half_edge_count)
-    return make_mesh(
+    return staging.make_mesh(
         np.concatenate([corners, centres]),
         np.stack([half_edges, t.next, t.half_edge_count + t.face], axis=1),
         {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "face_color"}},
@@ -187,15 +171,15 @@ def draw_creases(options: FigureOptions) -> list[Path]:
     """Render a cage, and its Catmull-Clark surface without creases, with the cage's own, and with all of them sharp."""
     cage = ControlCage.from_file(example_file("cages/rook.obj"))
     if options.cage:
-        cage = fitted(read(options.cage), cage.positions.min(axis=0), cage.positions.max(axis=0))
+        cage = staging.fitted(staging.read(options.cage), cage.positions.min(axis=0), cage.positions.max(axis=0))
         if not cage.tags.edges.any():
             raise FigureError(f'"{options.cage}" has no creases; expected a cage with some')
-    stage = load_stage("creases", width=options.resolution, height=round(HEIGHT * options.resolution))
-    scenes = {CAGE_TITLE: staged(stage, **_cage_shapes(cage))}
+    stage = staging.load_stage("creases", width=options.resolution, height=round(HEIGHT * options.resolution))
+    scenes = {CAGE_TITLE: staging.staged(stage, **_cage_shapes(cage))}
     for name, title in TITLES.items():
-        scenes[title] = staged(stage, shape=limit_surface(_tagged(cage, name), CREASE_RATE, MATERIAL))
+        scenes[title] = staging.staged(stage, shape=staging.limit_surface(_tagged(cage, name), CREASE_RATE, MATERIAL))
     figure, axes = panels(options, *rows_of(options, len(scenes)))
-    rendered = render_panels(options, axes, scenes.items())
+    rendered = staging.render_panels(options, axes, scenes.items())
     _draw_legend(axes[0, 0], cage)
     return write_figure(options, "creases", figure, rendered, pictures=[CAGE_TITLE, *TITLES])
 
@@ -213,12 +197,13 @@ def _cage_shapes(cage: ControlCage) -> SceneNode:
     """Shapes of the cage: flat faces, and edges as rods, which are thick and coloured where they are creases."""
     # Each triangle has three vertices of its own, so that no normals are averaged.
     positions = cage.positions[cage.triangles.ravel()]
-    shapes: SceneNode = {"faces": make_mesh(positions, np.arange(len(positions)).reshape(-1, 3), paint(PALE))}
+    triangles = np.arange(len(positions)).reshape(-1, 3)
+    shapes: SceneNode = {"faces": staging.make_mesh(positions, triangles, staging.paint(PALE))}
     t, half_edges = cage.topology, cage.topology.edge_half_edge
     ends = t.face_vertices[np.stack([half_edges, t.next[half_edges]], axis=1)]
     sharpness = cage.tags.edges[half_edges]
     looks = [EDGES[max(least for least in EDGES if least <= value)] for value in sharpness]
-    return shapes | edge_rods(cage, ends, sharpness, looks)
+    return shapes | staging.edge_rods(cage, ends, sharpness, looks)
 
 
 def labels(sharpness: NDArray[np.floating]) -> dict[int, str]:

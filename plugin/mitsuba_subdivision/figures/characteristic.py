@@ -321,12 +321,7 @@ def draw_curvature(options: FigureOptions) -> list[Path]:
             shown = _draw_disc(axis, zip(*grids[:2], values, strict=True), norm)
         plot = column[-1]
         plot.semilogy(DEPTHS, measured, "o", markersize=2, color=SERIES[1][0], label="surface")
-        plot.semilogy(
-            DEPTHS,
-            measured[-1] * rate ** (DEPTHS - DEPTHS[-1]),
-            color=SERIES[0][0],
-            label="(|λ₄|/λ₂²)ⁿ",
-        )
+        plot.semilogy(DEPTHS, measured[-1] * rate ** (DEPTHS - DEPTHS[-1]), color=SERIES[0][0], label="(|λ₄|/λ₂²)ⁿ")
         column[0].set_title(f"valence {valence}")
         plot.set(xlabel=f"level $n$\n|λ₄|/λ₂² = {rate:.3f}", ylim=(0.3, 1e6), box_aspect=0.75)
         plot.grid()

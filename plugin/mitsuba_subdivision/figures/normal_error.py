@@ -26,23 +26,11 @@ from ..schemes import scheme_named
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from ..tessellation.vertex_table import Tessellation
+from . import staging
 from .cages import edge_curves
 from .characteristic import patch_of_valence
 from .output import BETWEEN, SERIES, FigureError, FigureOptions, label_powers, panels, scientific, show, write_figure
 from .peers import osd_peer, osd_samples
-from .staging import (
-    around_vertices,
-    frame,
-    grid_points,
-    grid_triangles,
-    in_8_bits,
-    limit_surface,
-    load_stage,
-    make_mesh,
-    project,
-    render,
-    staged,
-)
 
 # Vertices within this radius of the extraordinary vertex show their normals, as needles of this length.
 NEEDLE_RADIUS = 0.3
@@ -99,7 +87,7 @@ def draw_artifact(options: FigureOptions) -> list[Path]:
     figure, axes = panels(options, len(rows), len(RULES))
     rendered, records = [], []
     for (valence, surface, beside, rate), row_axes in zip(rows, axes, strict=True):
-        stage = load_stage(f"valence{5 if options.cage else valence}", resolution=options.resolution)
+        stage = staging.load_stage(f"valence{5 if options.cage else valence}", resolution=options.resolution)
         emitters = [shape for shape in stage.shapes() if shape.is_emitter()]
         bsdf = next(shape.bsdf() for shape in stage.shapes() if not shape.is_emitter())
         for (title, evaluator, is_beside), axis in zip(RULES, row_axes, strict=True):
@@ -110,9 +98,9 @@ def draw_artifact(options: FigureOptions) -> list[Path]:
             if error >= 0.1:
                 shown_error = f"{error:.1f}°"
             sampling = {"scheme": options.scheme, "evaluator": evaluator, "sample_offset": offset}
-            scene = staged(stage, emitters, surface=limit_surface(surface.cage, rate, bsdf, **sampling))
-            rendered.append(render(scene, options, f"valence {valence}, {title}")[..., :3])
-            show(axis, in_8_bits(rendered[-1]), caption=f"{location}\nerror {shown_error}")
+            scene = staging.staged(stage, emitters, surface=staging.limit_surface(surface.cage, rate, bsdf, **sampling))
+            rendered.append(staging.render(scene, options, f"valence {valence}, {title}")[..., :3])
+            show(axis, staging.in_8_bits(rendered[-1]), caption=f"{location}\nerror {shown_error}")
             _draw_lines(axis, scene, surface, surface.tessellate(rate, evaluator, np.float32, offset))
             record = {"valence": valence, "rule": title, "level": level, "offset": distance, "error": error}
             records.append(record)
@@ -129,7 +117,7 @@ def _rows_of_user(path: Path, scheme: str) -> list[tuple[int, LimitSurface, floa
     if scheme != "catmull_clark":
         raise FigureError(f"--cage together with --scheme {scheme}; expected catmull_clark")
     rows, (_, rate) = [], ROWS[scheme, 5]
-    for valence, cage in around_vertices(path, 2, frame(surface_of(scheme, 5))).items():
+    for valence, cage in staging.around_vertices(path, 2, staging.frame(surface_of(scheme, 5))).items():
         # Where Stam's form has lost the normal, as above.
         subdominant = patch_of_valence(scheme_named(scheme), valence).basis.subdominant
         level = np.log(LOST) / np.log(subdominant)
@@ -149,8 +137,8 @@ def _draw_lines(axis: Axes, scene: mi.Scene, surface: LimitSurface, tessellation
     width, height = sensor.film().crop_size()
     axis.set(xlim=(0, width), ylim=(height, 0))
     # The needle of the extraordinary vertex comes first.
-    first, *others = project(sensor, needles, width)
-    curves = list(project(sensor, edges, width))
+    first, *others = staging.project(sensor, needles, width)
+    curves = list(staging.project(sensor, edges, width))
     axis.add_collection(LineCollection(curves, colors="#40362a", linewidths=0.3, alpha=0.4))
     axis.add_collection(LineCollection(others, colors="#1c4f72", linewidths=0.6, capstyle="round"))
     axis.add_collection(LineCollection([first], colors="#d8452a", linewidths=1.5, capstyle="round"))
@@ -174,7 +162,7 @@ def draw_error(options: FigureOptions) -> list[Path]:
     """Plot the angle between computed and exact normals at every level."""
     cages = {valence: extraordinary(valence) for valence in VALENCES}
     if options.cage:
-        cages = around_vertices(options.cage, len(VALENCES), frame(LimitSurface(extraordinary(5))))
+        cages = staging.around_vertices(options.cage, len(VALENCES), staging.frame(LimitSurface(extraordinary(5))))
     figure, axes = panels(options, len(cages), len(OFFSETS), sharex=True, sharey=True)
     for row, (valence, cage) in zip(axes, cages.items(), strict=True):
         for axis, offset in zip(row, OFFSETS, strict=True):
@@ -277,16 +265,16 @@ CLAY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.72, 0.66, 
 
 def on_stage(surface: LimitSurface, points: NDArray[np.floating], magnification: float) -> NDArray[np.float64]:
     """Points on the stage, seen along the normal of vertex 0, where the image reaches from -1 to 1."""
-    point, axes, _ = frame(surface)
+    point, axes, _ = staging.frame(surface)
     return (points - point) @ axes * (magnification / HALF_WIDTH)
 
 
 def draw_zoom(options: FigureOptions) -> list[Path]:
     """Draw a vertex of valence 5 at four magnifications: rendered, and the errors of normals, too small for shades."""
     surface = LimitSurface(offset_cage(extraordinary(ZOOM_VALENCE), ZOOM_OFFSET))
-    stage, resolution = load_stage("zoom", resolution=options.resolution), options.resolution
+    stage, resolution = staging.load_stage("zoom", resolution=options.resolution), options.resolution
     sensor, count = stage.sensors()[0], max(resolution // 2, 8)
-    triangles = grid_triangles(count, ZOOM_VALENCE)
+    triangles = staging.grid_triangles(count, ZOOM_VALENCE)
     rows = [method for method in METHODS if method != "opensubdiv" or osd_peer()]
     figure, axes = panels(options, len(rows), len(MAGNIFICATIONS))
     rendered, records = [], []
@@ -294,14 +282,15 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
         uv, positions, exact = panel_samples(surface, magnification, count)
         # Of all elements' samples, the one that is nearest to the centre of each pixel, ``(height, width)``.
         points = positions.reshape(-1, 3)
-        centres = grid_points(np.arange(resolution) + 0.5).reshape(resolution, -1, 2)
-        nearest = np.asarray(cKDTree(project(sensor, points, resolution)).query(centres)[1])
-        lines = project(sensor, _level_lines(surface, magnification), resolution)
+        centres = staging.grid_points(np.arange(resolution) + 0.5).reshape(resolution, -1, 2)
+        nearest = np.asarray(cKDTree(staging.project(sensor, points, resolution)).query(centres)[1])
+        lines = staging.project(sensor, _level_lines(surface, magnification), resolution)
         for method, axis in zip(rows, column, strict=True):
             normals, errors, median = normals_by(surface, uv, positions, exact, method)
-            mesh = make_mesh(points, triangles, CLAY, vertex_normals=(normals @ frame(surface)[1]).reshape(-1, 3))
+            on_mesh = (normals @ staging.frame(surface)[1]).reshape(-1, 3)
+            mesh = staging.make_mesh(points, triangles, CLAY, vertex_normals=on_mesh)
             name = f"{METHODS[method]}, x {magnification}".replace("\n", ", ")
-            rendered.append(render(staged(stage, mesh=mesh), options, name))
+            rendered.append(staging.render(staging.staged(stage, mesh=mesh), options, name))
             _draw_halves(axis, rendered[-1], errors.ravel()[nearest], lines)
             axis.set_xlabel(_degrees(median))
             # The length of the scale bar is one on the surface, whose cage has the radius 1.
@@ -334,7 +323,7 @@ def panel_samples(surface: LimitSurface, magnification: float, count: int) -> tu
     Returns parameters ``(s, 2)``; positions on the stage and normals, in float64, ``(valence, s, 3)`` each: this far
     from the origin, float32 cannot tell the points of the last panels apart.
     """
-    uv = grid_points(np.linspace(0, 1, count + 1))
+    uv = staging.grid_points(np.linspace(0, 1, count + 1))
     # Stam's form has no value at the point itself.
     uv[0] = 0.1 / count
     uv *= parameter_extent(magnification)
@@ -385,7 +374,7 @@ def _level_lines(surface: LimitSurface, magnification: float) -> NDArray[np.floa
 def _draw_halves(axis: Axes, pixels: NDArray[np.float32], errors: FloatArray, lines: FloatArray) -> None:
     """Draw a rendered image, errors in degrees over its right half, and lines in pixels over both."""
     height, width = errors.shape
-    axis.imshow(in_8_bits(pixels), interpolation="lanczos")
+    axis.imshow(staging.in_8_bits(pixels), interpolation="lanczos")
     right = (width // 2, width, height, 0)
     axis.imshow(errors[:, width // 2 :], cmap=COLOURS, norm=ERROR_SCALE, interpolation="nearest", extent=right)
     axis.add_collection(LineCollection(list(lines), colors="black", linewidths=0.3, alpha=0.6))

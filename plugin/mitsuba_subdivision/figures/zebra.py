@@ -19,23 +19,9 @@ from ..cage.named_cages import cube
 from ..regression.scene import render_pixels
 from ..regression.tiers import normal_angle
 from ..surface import LimitSurface
+from . import staging
 from .output import FigureOptions, hide_frame, panels, show, write_figure
 from .peers import blender, blender_mesh, osd_peer, osd_samples
-from .staging import (
-    around_vertices,
-    camera_matrix,
-    frame,
-    grid_points,
-    grid_triangles,
-    limit_surface,
-    load_stage,
-    make_mesh,
-    on_white,
-    project,
-    render,
-    split_quads,
-    staged,
-)
 
 # Level of the refined mesh, as programs without limit surfaces render it.
 LEVEL = 3
@@ -63,18 +49,18 @@ RING = "#0a84c6"
 
 def draw_zebra(options: FigureOptions) -> list[Path]:
     """Render mirrors amid stripes with the normals of several methods, and their angles to the exact ones below."""
-    stage = load_stage("zebra", resolution=options.resolution, fov=FIELD_OF_VIEW)
+    stage = staging.load_stage("zebra", resolution=options.resolution, fov=FIELD_OF_VIEW)
     surface, level, at = LimitSurface(cube()), FINE_LEVEL, (CORNER_FACE, CORNER)
     if options.cage:
-        (cage,) = around_vertices(options.cage, 1, frame(surface, *at)).values()
+        (cage,) = staging.around_vertices(options.cage, 1, staging.frame(surface, *at)).values()
         surface, level, at = LimitSurface(cage), OWN_LEVEL, (0, 0)
     shapes, titles = _shapes(surface.cage, level)
     stripes = _stripes(stage.sensors()[0], STRIPES)
     # Shading normals where a few rays of each pixel hit, (rays, height, width, 3).
     aov, pixels, normals = mi.load_dict({"type": "aov", "aovs": "normal:sh_normal"}), {}, {}
     for name, shape in shapes.items():
-        scene = staged(stage, shape=shape, stripes=stripes)
-        pixels[name] = render(scene, options, f"reflection lines: {name}")
+        scene = staging.staged(stage, shape=shape, stripes=stripes)
+        pixels[name] = staging.render(scene, options, f"reflection lines: {name}")
         rays = [render_pixels(scene, seed, 1, integrator=aov)[..., -3:] for seed in range(NORMAL_RAYS)]
         normals[name] = np.array(rays, dtype=np.float64)
     # All surfaces get the same rays. The median leaves out a ray that slips between two triangles.
@@ -92,7 +78,7 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
         hide_frame(axis)
     _draw_overview(axes[1, 0], options, shapes["exact"])
     figure.colorbar(shown, ax=axes[1], fraction=0.06, pad=0.01, aspect=22, label="degrees")
-    corner = project(stage.sensors()[0], tip, options.resolution)[0]
+    corner = staging.project(stage.sensors()[0], tip, options.resolution)[0]
     for axis in (*axes[0], *axes[1, 1:]):
         for colour, line in (("white", 2), (RING, 1)):
             axis.plot(*corner, "o", markersize=5, mfc="none", mec=colour, mew=line)
@@ -102,25 +88,25 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
 
 def _shapes(cage: ControlCage, level: int) -> tuple[dict[str, Any], dict[str, tuple[str, str]]]:
     """Mirrors by name, the exact one first; and their titles: who made the surface, and how."""
-    exact, refined = limit_surface(cage, 2**level, MIRROR), cage
+    exact, refined = staging.limit_surface(cage, 2**level, MIRROR), cage
     for _ in range(LEVEL):
         refined = refined.refined()
     quads = refined.face_vertices.reshape(-1, 4)[~refined.is_hole]
     # Mitsuba averages its normals at the vertices.
-    shapes = {"exact": exact, "mesh": make_mesh(refined.positions, split_quads(quads), MIRROR)}
+    shapes = {"exact": exact, "mesh": staging.make_mesh(refined.positions, staging.split_quads(quads), MIRROR)}
     averaged = f"level {LEVEL},\naveraged normals"
     titles = {"exact": ("This package", "exact\nnormals"), "mesh": ("Refined mesh", averaged)}
     if program := osd_peer():
         # A grid as fine as that of the exact surface, for each face alone
-        uv, shown = grid_points(np.linspace(0, 1, 2**level + 1)), np.flatnonzero(~cage.is_hole)
+        uv, shown = staging.grid_points(np.linspace(0, 1, 2**level + 1)), np.flatnonzero(~cage.is_hole)
         points, normals = osd_samples(program, cage, shown[:, None], uv, "bfr", OPENSUBDIV_LEVEL)
-        triangles = grid_triangles(2**level, len(shown))
-        shapes["opensubdiv"] = make_mesh(points, triangles, MIRROR, vertex_normals=normals)
+        triangles = staging.grid_triangles(2**level, len(shown))
+        shapes["opensubdiv"] = staging.make_mesh(points, triangles, MIRROR, vertex_normals=normals)
         titles["opensubdiv"] = ("OpenSubdiv", f"level {OPENSUBDIV_LEVEL},\nown normals")
     # Blender has no holes.
     if not len(cage.holes) and (program := blender()):
         points, normals, quads, version = blender_mesh(program, cage, level)
-        shapes["blender"] = make_mesh(points, split_quads(quads), MIRROR, vertex_normals=normals)
+        shapes["blender"] = staging.make_mesh(points, staging.split_quads(quads), MIRROR, vertex_normals=normals)
         titles["blender"] = (f"Blender {version}", f"level {level},\naveraged normals")
     return shapes, titles
 
@@ -128,17 +114,17 @@ def _shapes(cage: ControlCage, level: int) -> tuple[dict[str, Any], dict[str, tu
 def _draw_bands(axis: Axes, pixels: NDArray[np.float32], exact: NDArray[np.float32], title: str, caption: str) -> None:
     """Draw a rendered image, with colour where its bands differ from those of the exact surface."""
     wrong = np.clip(np.abs(pixels - exact)[..., :3].mean(axis=-1, keepdims=True) / (LIGHT - DARK), 0, 1)
-    marked = (1 - wrong) * on_white(pixels) + wrong * WRONG
+    marked = (1 - wrong) * staging.on_white(pixels) + wrong * WRONG
     share = "reference" if pixels is exact else f"{100 * wrong.mean():.1f} % wrong"
     show(axis, marked.round().astype(np.uint8), title, f"{caption}\n{share}")
 
 
 def _draw_overview(axis: Axes, options: FigureOptions, shape: mi.Shape) -> None:
     """Draw the whole surface, with a frame where the close-up is."""
-    stage = load_stage("zebra", resolution=options.resolution, fov=WIDE_FIELD_OF_VIEW)
-    scene = staged(stage, shape=shape, stripes=_stripes(stage.sensors()[0], WIDE_STRIPES))
+    stage = staging.load_stage("zebra", resolution=options.resolution, fov=WIDE_FIELD_OF_VIEW)
+    scene = staging.staged(stage, shape=shape, stripes=_stripes(stage.sensors()[0], WIDE_STRIPES))
     caption = "around the vertex" if options.cage else "whole surface"
-    show(axis, on_white(render(scene, options, "whole surface")), caption=caption)
+    show(axis, staging.on_white(staging.render(scene, options, "whole surface")), caption=caption)
     middle = options.resolution / 2
     half = np.tan(np.radians(FIELD_OF_VIEW / 2)) / np.tan(np.radians(WIDE_FIELD_OF_VIEW / 2)) * middle
     corner = (middle - half, middle - half)
@@ -150,7 +136,7 @@ def _stripes(sensor: mi.Sensor, count: int) -> mi.Emitter:
     height = (np.arange(STRIPE_PIXELS) + 0.5) / STRIPE_PIXELS
     bands = np.where(np.floor(height * count) % 2 == 0, LIGHT, DARK)[:, None, None] * np.ones((1, 4, 3))
     # The poles of an environment map lie on its y axis.
-    x, y, z = camera_matrix(sensor)[:3, :3].T
+    x, y, z = staging.camera_matrix(sensor)[:3, :3].T
     cos, sin = np.cos(np.radians(AXIS_ANGLE)), np.sin(np.radians(AXIS_ANGLE))
     turn = np.eye(4)
     turn[:3, :3] = np.stack([sin * x - cos * y, cos * x + sin * y, z], axis=1)

@@ -15,21 +15,9 @@ from typing import Any
 import pytest
 
 from ..variants import chosen_variant, variant_set
-from . import RegressionError
+from . import RegressionError, renders
 from .compare import Comparison
 from .image import save_image
-from .renders import (
-    BATCH,
-    REFERENCE_SPP,
-    TEST_SPP,
-    Sampling,
-    UnusableReference,
-    as_reference,
-    compare_scene,
-    load_reference,
-    render_pass,
-    variant_for,
-)
 from .report import write_report
 from .scene import BOX, SceneSource, load_scene
 from .tiers import Status, Tolerances
@@ -58,9 +46,9 @@ class RenderRegression:
         name: str | None = None,
         parameters: Mapping[str, Any] | None = None,
         variant: str | None = None,
-        spp: int = TEST_SPP,
-        reference_spp: int = REFERENCE_SPP,
-        batch: int = BATCH,
+        spp: int = renders.TEST_SPP,
+        reference_spp: int = renders.REFERENCE_SPP,
+        batch: int = renders.BATCH,
         tiers: Sequence[str] | None = None,
         tolerances: Mapping[str, float] | None = None,
         seed: int = 0,
@@ -99,26 +87,26 @@ class RenderRegression:
         def write() -> None:
             with variant_set(chosen_variant(variant)):
                 loaded = load_scene(scene, given, BOX)
-                image = render_pass(loaded, Sampling.of_spp(reference_spp, batch), with_probe=True)
-                save_image(path, as_reference(image, loaded.path, path, new_limits))
+                image = renders.render_pass(loaded, renders.Sampling.of_spp(reference_spp, batch), with_probe=True)
+                save_image(path, renders.as_reference(image, loaded.path, path, new_limits))
 
         if self.update == "all":
             write()
             return None
         try:
-            reference = load_reference(path)
+            reference = renders.load_reference(path)
             stored = reference.metadata.get("parameters", {})
             if stored != given:
-                raise UnusableReference(
+                raise renders.UnusableReference(
                     f'the reference "{path}" was made with the scene parameters {stored}; this test has {given}'
                 )
             limits = Tolerances().with_values({**reference.metadata.get("tolerances", {}), **(tolerances or {})})
             # All scenes with a reference share the probability of a false alarm, whichever tests are run.
             suite_size = max(1, len(list(self.references.glob("*.exr"))))
             spp = max(1, round(spp * self.spp_scale))
-            with variant_set(chosen_variant(variant) if variant else variant_for(reference)):
-                comparison = compare_scene(reference, scene, tiers, spp, limits, suite_size, seed)
-        except UnusableReference as problem:
+            with variant_set(chosen_variant(variant) if variant else renders.variant_for(reference)):
+                comparison = renders.compare_scene(reference, scene, tiers, spp, limits, suite_size, seed)
+        except renders.UnusableReference as problem:
             if self.update == "no":
                 pytest.fail(f"{problem}; make it with: pytest {shlex.quote(self.node.nodeid)} --render-update", False)
             write()

@@ -202,10 +202,7 @@ def render_image(loaded: LoadedScene, spp: int, seed: int = 0) -> NDArray[np.flo
     """Render with all channels: many samples in parts, where the sampler is "independent"; else by one `mi.render`."""
     is_independent = str(loaded.sensor.sampler()).startswith("IndependentSampler")
     parts = parts_of(spp, loaded.size) if is_independent else [spp]
-    if len(parts) > 1:
-        return render_parts(loaded.scene, parts, seed, sensor=loaded.sensor_index)
-    with timed("Rendering"):
-        return render_pixels(loaded.scene, seed, spp, sensor=loaded.sensor_index)
+    return render_parts(loaded.scene, parts, seed, sensor=loaded.sensor_index)
 
 
 def parts_of(spp: int, size: tuple[int, int]) -> list[int]:
