@@ -22,13 +22,11 @@ from patches.closed_cages import torus
 
 # The module alone: what a process imports besides takes a second.
 WRITER = f"""
-import importlib.util, itertools, pathlib, sys
-spec = importlib.util.spec_from_file_location("whole_file", {module.__file__!r})
-module = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(module)
+import itertools, pathlib, runpy, sys
+whole_file = runpy.run_path({module.__file__!r})["whole_file"]
 print("ready", flush=True)
 for _ in itertools.count():
-    with module.whole_file(pathlib.Path(sys.argv[1])) as beside, beside.open("wb") as stream:
+    with whole_file(pathlib.Path(sys.argv[1])) as beside, beside.open("wb") as stream:
         for _ in range(64):
             stream.write(sys.argv[2].encode() * {1 << 14})
             stream.flush()

@@ -1,7 +1,7 @@
 """What is said of the project in more than one place is the same in all: versions, systems, commands, links."""
 
-import importlib.util
 import re
+import runpy
 import shutil
 import subprocess
 
@@ -94,14 +94,10 @@ def test_the_changelog_and_the_citation_have_the_version_and_its_day_and_the_usu
         assert kinds == [kind for kind in ("Added", "Changed", "Fixed") if kind in kinds] != []
 
 
-@pytest.fixture
-def long_description():
-    """The module that makes the long description; hatchling loads it by its path."""
+def long_description(*words):
+    """By the module that hatchling loads by its path."""
     pytest.importorskip("hatchling")
-    spec = importlib.util.spec_from_file_location("long_description", ROOT / "plugin" / "long_description.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.long_description
+    return runpy.run_path(str(ROOT / "plugin" / "long_description.py"))["long_description"](*words)
 
 
 def targets(text):
@@ -109,7 +105,7 @@ def targets(text):
 
 
 @pytest.mark.parametrize("repository", [None, REPOSITORY])
-def test_links_of_the_long_description_work_on_a_package_index(long_description, repository):
+def test_links_of_the_long_description_work_on_a_package_index(repository):
     readme = read("README.md")
     text = long_description(readme, repository, "v1.2.3")
     links = targets(text)
@@ -126,7 +122,8 @@ def test_links_of_the_long_description_work_on_a_package_index(long_description,
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_the_metadata_of_the_package_is_as_it_is_stated(long_description):
+def test_the_metadata_of_the_package_is_as_it_is_stated():
+    pytest.importorskip("hatchling")
     from hatchling.metadata.core import ProjectMetadata
     from hatchling.plugin.manager import PluginManager
 
