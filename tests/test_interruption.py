@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import shutil
 import signal
 import struct
 import subprocess
@@ -9,6 +10,7 @@ import sys
 import termios
 import threading
 import time
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -19,12 +21,7 @@ from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 # Windows has no such terminals.
 pty = pytest.importorskip("pty")
 
-SCENE = """<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/>
-    <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="512"/>
-        <integer name="height" value="512"/></film></sensor>
-    <shape type="subdivision"><string name="filename" value="cube.obj"/>
-        <string name="shading" value="{shading}"/></shape>
-</scene>"""
+SCENE = Path(__file__).parent / "data" / "cube.xml"
 # The command line, also where the tests run in the background and so ignore what this is about.
 LISTENING = """import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -88,12 +85,12 @@ def test_ctrl_c_ends_a_render(tmp_path, shading, seconds, words, variant, reques
         pytest.skip(str(hook_problem()))
     request.getfixturevalue(f"variant_{variant}")
     cube().save(tmp_path / "cube.obj")
-    (tmp_path / "scene.xml").write_text(SCENE.format(shading=shading))
+    shutil.copy(SCENE, tmp_path / "scene.xml")
     mine, its = pty.openpty()
     # A terminal of no width would show no progress.
     fcntl.ioctl(its, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
     command = [sys.executable, "-c", LISTENING, "render", "scene.xml", "-o", "picture.exr"]
-    command += ["--spp", SAMPLES, "--variant", variant, *words]
+    command += ["--spp", SAMPLES, "--variant", variant, "-D", "size=512", "-D", f"shading={shading}", *words]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     render = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=its, cwd=tmp_path, env=environment)
     request.addfinalizer(render.kill)

@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -20,11 +21,7 @@ from mitsuba_subdivision.figures.output import write_figure
 from mitsuba_subdivision.messages import counted, print_error, print_remark, timed
 from mitsuba_subdivision.regression.image import write_exr
 
-SCENE = """<scene version="3.0.0"><integrator type="direct"/>
-    <sensor type="perspective"><film type="hdrfilm"><integer name="width" value="4"/>
-        <integer name="height" value="4"/></film></sensor>
-    <shape type="subdivision"><string name="filename" value="cube.obj"/></shape>
-</scene>"""
+SCENE = (Path(__file__).parent / "data" / "cube.xml").read_text()
 LOOP = SCENE.replace("</shape>", '<string name="scheme" value="loop"/></shape>')
 BARE = SCENE.replace('<integrator type="direct"/>', "")
 RENDER = ["render", "scene.xml", "-o", "picture.exr"]
