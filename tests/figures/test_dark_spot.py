@@ -27,7 +27,7 @@ def disc_luminance(valence, **parameters):
         str(SCENES / f"valence{valence}.xml"), resolution=str(RESOLUTION), spp=str(SPP), fov="5", **parameters
     )
     point = surface_of("catmull_clark", valence).evaluate(0, [[0.0, 0.0]]).p[0]
-    centre, edge = project(scene.sensors()[0], np.stack([point, point + np.array([RADIUS, 0, 0])]), RESOLUTION)
+    centre, edge = project(scene.sensors()[0], np.stack([point, point + np.array([RADIUS, 0, 0])]))
     y, x = np.indices((RESOLUTION, RESOLUTION)) + 0.5
     disc = np.hypot(x - centre[0], y - centre[1]) < np.linalg.norm(edge - centre)
     assert disc.sum() > 20

@@ -301,7 +301,7 @@ def test_projection_finds_what_the_camera_sees():
         alpha = np.array(mi.render(scene, spp=64), dtype=np.float64)[..., 3]
         y, x = np.indices(alpha.shape) + 0.5
         centre = np.array([(alpha * x).sum(), (alpha * y).sum()]) / alpha.sum()
-        np.testing.assert_allclose(project(scene.sensors()[0], place, 64), centre, atol=0.1)
+        np.testing.assert_allclose(project(scene.sensors()[0], place), centre, atol=0.1)
     towards = np.array([3, -4, 5]) / np.sqrt(50)
     seen = visible(scene, place + 0.1 * np.stack([towards, -towards]))
     assert seen.tolist() == [True, False]

@@ -313,4 +313,4 @@ def test_frames_passes_and_references_have_the_bits_of_one_machine_although_a_wo
 def test_no_cluster_is_said():
     pytest.importorskip("distributed")
     with pytest.raises(RegressionError, match="no Dask scheduler"):
-        render_on_cluster("nonsense://", load_scene, "llvm_ad_rgb", None, 0)
+        render_on_cluster("nonsense://", load_scene, None, 0)

@@ -66,7 +66,5 @@ def _millimetres(text: str) -> float:
 
 
 _width = checked(
-    _millimetres,
-    lambda width: COLUMN <= width <= WIDEST,
-    f"a width from {COLUMN:g}mm to {WIDEST:g}mm, or in inches",
+    _millimetres, lambda width: COLUMN <= width <= WIDEST, f"a width from {COLUMN:g}mm to {WIDEST:g}mm, or in inches"
 )

@@ -333,8 +333,7 @@ def _render_by_passes(options: argparse.Namespace, is_model: bool) -> None:
     settings = {"with_probe": options.reference}
     with threads_set(options.threads):
         if options.dask:
-            variant = str(mi.variant())
-            image = renders.render_on_cluster(options.dask, load, variant, sampling, options.passes or 0, **settings)
+            image = renders.render_on_cluster(options.dask, load, sampling, options.passes or 0, **settings)
         elif options.share:
             image = renders.render_pass(loaded, sampling, number, count, **settings)
         else:
@@ -365,7 +364,7 @@ def _on_cluster(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator
     command = pickle.dumps(_as_data(options) | {"command": uuid4().hex})
     warned: set[str] = set()
     with cluster(options.dask) as client:
-        for number, (image, messages) in results(client, partial(_frame, command), str(mi.variant()), numbers):
+        for number, (image, messages) in results(client, partial(_frame, command), numbers):
             for message in dict.fromkeys(messages):
                 if message not in warned:
                     warn(message)

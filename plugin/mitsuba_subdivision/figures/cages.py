@@ -70,9 +70,9 @@ def draw_subdivision(options: FigureOptions) -> list[Path]:
     for axis, (title, caption, scene, lines, width, points) in zip(axes.flat, drawn, strict=False):
         rendered.append(staging.render(scene, options, title))
         show(axis, staging.on_white(rendered[-1]), title, caption)
-        runs = staging.visible_runs(scene, lines, resolution)
+        runs = staging.visible_runs(scene, lines)
         axis.add_collection(LineCollection(runs, colors="#14181c", linewidths=width, capstyle="round"))
-        seen = staging.project(scene.sensors()[0], points[staging.visible(scene, points)], resolution)
+        seen = staging.project(scene.sensors()[0], points[staging.visible(scene, points)])
         axis.plot(*seen.T, "o", color="#d1432b", markersize=2, markeredgecolor="white", markeredgewidth=0.2)
         # The part of the square image that the surface fills.
         axis.set(xlim=(0, resolution), ylim=(0.84 * resolution, 0.13 * resolution))

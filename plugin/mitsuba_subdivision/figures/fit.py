@@ -354,10 +354,9 @@ def _finish(axis: Axes, quantity: str, *, is_logarithmic: bool = False) -> None:
 
 def _label(axis: Axes, sensor: mi.Sensor, cage: ControlCage, sharpness: FloatArray) -> None:
     """Write their sharpness on the edges that the camera sees."""
-    width = int(sensor.film().crop_size()[0])
     box = {"boxstyle": "round,pad=0.15", "facecolor": LABEL, "edgecolor": "none"}
     for edge in np.flatnonzero(in_front(cage, camera_matrix(sensor)[:3, 3])):
-        x, y = project(sensor, cage.positions[cube().edges[edge]].mean(axis=0), width).tolist()
+        x, y = project(sensor, cage.positions[cube().edges[edge]].mean(axis=0)).tolist()
         axis.text(x, y, f"{sharpness[edge]:.1f}", color="white", ha="center", va="center", bbox=box)
 
 

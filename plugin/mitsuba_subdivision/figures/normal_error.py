@@ -137,8 +137,8 @@ def _draw_lines(axis: Axes, scene: mi.Scene, surface: LimitSurface, tessellation
     width, height = sensor.film().crop_size()
     axis.set(xlim=(0, width), ylim=(height, 0))
     # The needle of the extraordinary vertex comes first.
-    first, *others = staging.project(sensor, needles, width)
-    curves = list(staging.project(sensor, edges, width))
+    first, *others = staging.project(sensor, needles)
+    curves = list(staging.project(sensor, edges))
     axis.add_collection(LineCollection(curves, colors="#40362a", linewidths=0.3, alpha=0.4))
     axis.add_collection(LineCollection(others, colors="#1c4f72", linewidths=0.6, capstyle="round"))
     axis.add_collection(LineCollection([first], colors="#d8452a", linewidths=1.5, capstyle="round"))
@@ -283,8 +283,8 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
         # Of all elements' samples, the one that is nearest to the centre of each pixel, ``(height, width)``.
         points = positions.reshape(-1, 3)
         centres = staging.grid_points(np.arange(resolution) + 0.5).reshape(resolution, -1, 2)
-        nearest = np.asarray(cKDTree(staging.project(sensor, points, resolution)).query(centres)[1])
-        lines = staging.project(sensor, _level_lines(surface, magnification), resolution)
+        nearest = np.asarray(cKDTree(staging.project(sensor, points)).query(centres)[1])
+        lines = staging.project(sensor, _level_lines(surface, magnification))
         for method, axis in zip(rows, column, strict=True):
             normals, errors, median = normals_by(surface, uv, positions, exact, method)
             on_mesh = (normals @ staging.frame(surface)[1]).reshape(-1, 3)

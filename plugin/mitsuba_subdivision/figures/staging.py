@@ -173,15 +173,15 @@ def render_panels(
     return rendered
 
 
-def project(sensor: mi.Sensor, points: NDArray[np.floating], resolution: int) -> NDArray[np.float64]:
-    """Pixel coordinates ``(.., 2)`` of world points ``(.., 3)``, for a square image of this width."""
+def project(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Pixel coordinates ``(.., 2)`` of world points ``(.., 3)``, for a square image."""
     parameters = mi.traverse(sensor)
     camera = _in_camera(sensor, points)
     # Mitsuba's cameras look along +z, with x to the left and y up. An orthographic camera sees x and y from -1 to 1.
     half_width = np.ones_like(camera[..., 2:])
     if "x_fov" in parameters:
         half_width = camera[..., 2:] * np.tan(np.radians(float(np.array(parameters["x_fov"]).item()) / 2))
-    return (1 - camera[..., :2] / half_width) / 2 * resolution
+    return (1 - camera[..., :2] / half_width) / 2 * int(sensor.film().crop_size()[0])
 
 
 def visible(scene: mi.Scene, points: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -195,10 +195,10 @@ def visible(scene: mi.Scene, points: NDArray[np.floating]) -> NDArray[np.bool_]:
     return ~np.array(scene.ray_test(mi.Ray3f(upload(mi.Point3f, start), towards)))
 
 
-def visible_runs(scene: mi.Scene, lines: NDArray[np.floating], resolution: int) -> list[NDArray[np.float64]]:
+def visible_runs(scene: mi.Scene, lines: NDArray[np.floating]) -> list[NDArray[np.float64]]:
     """Parts of polylines ``(m, points, 3)`` that the camera sees, in pixels, each ``(.., 2)``."""
     seen = visible(scene, lines.reshape(-1, 3)).reshape(lines.shape[:2])
-    positions = project(scene.sensors()[0], lines, resolution)
+    positions = project(scene.sensors()[0], lines)
     runs = []
     for line, shown in zip(positions, seen, strict=True):
         changes = 1 + np.flatnonzero(np.diff(shown))

@@ -78,7 +78,7 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
         hide_frame(axis)
     _draw_overview(axes[1, 0], options, shapes["exact"])
     figure.colorbar(shown, ax=axes[1], fraction=0.06, pad=0.01, aspect=22, label="degrees")
-    corner = staging.project(stage.sensors()[0], tip, options.resolution)[0]
+    corner = staging.project(stage.sensors()[0], tip)[0]
     for axis in (*axes[0], *axes[1, 1:]):
         for colour, line in (("white", 2), (RING, 1)):
             axis.plot(*corner, "o", markersize=5, mfc="none", mec=colour, mew=line)

@@ -230,15 +230,15 @@ def cluster(address: str) -> Iterator[Client]:
         yield client
 
 
-def results(client: Client, work: Callable[[int], T], variant: str, numbers: Sequence[int]) -> Iterator[tuple[int, T]]:
-    """Numbers and what the workers of a cluster make of them by picklable work, in the order in which they finish.
+def results(client: Client, work: Callable[[int], T], numbers: Sequence[int]) -> Iterator[tuple[int, T]]:
+    """Numbers and what the workers of a cluster make of them by picklable work, as they finish.
 
     Where a worker ends early, another one repeats its work.
     """
     from distributed import as_completed
 
     # Not pure, in the sense of Dask: a repeated request renders again.
-    futures = as_completed(client.map(partial(_work, work, variant), numbers, pure=False), with_results=True)
+    futures = as_completed(client.map(partial(_work, work, str(mi.variant())), numbers, pure=False), with_results=True)
     return (result for _, result in futures)
 
 
@@ -252,7 +252,6 @@ def _work(work: Callable[[int], T], variant: str, number: int) -> tuple[int, T]:
 def render_on_cluster(
     address: str,
     load: Callable[[], LoadedScene],  # Picklable
-    variant: str,
     sampling: Sampling,
     count: int,  # 0 for the number of threads
     *,
@@ -269,7 +268,7 @@ def render_on_cluster(
         def work(number: int) -> Image:
             return render_pass(load(), sampling, number, count, with_probe=with_probe)
 
-        return merge_passes([image for _, image in results(client, work, variant, range(1, count + 1))])
+        return merge_passes([image for _, image in results(client, work, range(1, count + 1))])
 
 
 # Samples per pixel: four batches for a test, and 64 times as many for a reference.
