@@ -90,7 +90,8 @@ def test_ctrl_c_ends_a_render(tmp_path, shading, seconds, words, variant, reques
     # A terminal of no width would show no progress.
     fcntl.ioctl(its, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
     command = [sys.executable, "-c", LISTENING, "render", "scene.xml", "-o", "picture.exr"]
-    command += ["--spp", SAMPLES, "--variant", variant, "-D", "size=512", "-D", f"shading={shading}", *words]
+    command += ["--spp", SAMPLES, "--variant", variant, "-D", f"shading={shading}", *words]
+    command += ["-D", "size=512", "-D", "integrator=path"]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     render = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=its, cwd=tmp_path, env=environment)
     request.addfinalizer(render.kill)

@@ -23,7 +23,7 @@ from mitsuba_subdivision.regression.image import write_exr
 
 SCENE = (Path(__file__).parent / "data" / "cube.xml").read_text()
 LOOP = SCENE.replace("</shape>", '<string name="scheme" value="loop"/></shape>')
-BARE = SCENE.replace('<integrator type="direct"/>', "")
+BARE = SCENE.replace('<integrator type="$integrator"/>', "")
 RENDER = ["render", "scene.xml", "-o", "picture.exr"]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 
