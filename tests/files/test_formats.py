@@ -145,11 +145,10 @@ def test_what_is_saved_is_read_back(any_cage, suffix, request, tmp_path, np_rng)
     path, cage = tmp_path / f"cage{suffix}", ControlCage.from_arrays(*arrays, **data, **rules)
     any_cage.save(path)
     cage.save(path)
-    for given in (path, str(path)):
-        again = ControlCage.from_file(given)
-        assert same(again.contents, cage.contents)
-        assert suffix in USD or list(again.attributes) == list(cage.attributes)
-        assert again.source.name.startswith(f'"{path}"')
+    again = ControlCage.from_file(str(path) if number % 2 else path)
+    assert same(again.contents, cage.contents)
+    assert suffix in USD or list(again.attributes) == list(cage.attributes)
+    assert again.source.name.startswith(f'"{path}"')
     assert list(tmp_path.iterdir()) == [path]
 
 
