@@ -16,7 +16,7 @@ from mitsuba_subdivision.schemes.scheme import StencilTable
 from mitsuba_subdivision.surface import LimitSurface
 from mitsuba_subdivision.tessellation.adaptive_grid import PatchFrames, whole_patches
 from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
-from mitsuba_subdivision.tessellation.tile_rates import TileRates, _extent
+from mitsuba_subdivision.tessellation.tile_rates import TileRates, _extent, _normals_to
 from scipy import sparse
 
 # Samples along each side, less one. They miss this part of an extent at most: a smooth function is lower by an eighth
@@ -138,3 +138,14 @@ def test_a_tile_without_a_normal_is_no_smaller_than_it_is():
         assert not rates.are_flat(tile, tiles, values)[is_larger].any()
         larger += np.count_nonzero(is_larger)
     assert larger
+
+
+def test_two_unit_vectors_lie_across_every_vector(np_rng):
+    """Whatever its length; across zero lie any two."""
+    lengths = 10.0 ** np.linspace(-9, 9, 20)
+    ways = np.hstack([np_rng.normal(size=(3, 20)) * lengths, np.eye(3), np.zeros((3, 1))])
+    length = np.linalg.norm(ways, axis=0)
+    frame = np.stack([*_normals_to(ways), ways / np.where(length > 0, length, 1)])
+    expected = np.tile(np.eye(3), (ways.shape[1], 1, 1))
+    expected[length == 0, 2, 2] = 0
+    np.testing.assert_allclose(np.einsum("idt,jdt->tij", frame, frame), expected, atol=ROUNDING)
