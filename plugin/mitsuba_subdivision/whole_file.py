@@ -15,7 +15,7 @@ _unfinished: set[Path] = set()
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def whole_file(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` to write to; at the end, that file replaces ``path``.
 
     The temporary name has the suffix of ``path``. If writing fails, nothing stays behind, and a file that was there
@@ -24,6 +24,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     Raises FileNotFoundError if the folder does not exist. Raises OSError if the file cannot be written; the message
     names ``path``.
     """
+    path = Path(path)
     if path.exists() and not path.is_file() and not path.is_dir():
         yield path
         return

@@ -10,8 +10,7 @@ import re
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +19,10 @@ from ..cage.contents import RULES, Attribute, CageContents
 from ..cage.errors import CageError, CageSource, shortened, warn
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..whole_file import whole_file
 from .formats import faces_by_name, warn_of_losses
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 # Rows that are turned into text at once, which bounds the memory for numbers as Python objects.
 ROWS = 1 << 16
@@ -434,7 +435,9 @@ def write_obj(contents: CageContents, path: str | Path) -> None:
     of_face = np.array(names, dtype=object)[owner]
     for face in np.flatnonzero(of_face != np.append([""], of_face[:-1])):
         faces[face] = f"usemtl {of_face[face]}\n{faces[face]}"
-    with whole_file(Path(path)) as beside, beside.open("w", encoding="utf-8", newline="\n") as stream:
+    from ..whole_file import whole_file  # Not above: reading does not need it.
+
+    with whole_file(path) as beside, beside.open("w", encoding="utf-8", newline="\n") as stream:
         stream.write(f"# {len(contents.positions)} vertices, {len(faces)} faces\n")
         stream.writelines(_number_statements("v", np.asarray(contents.positions, np.float64)))
         if texcoords is not None:
@@ -453,7 +456,9 @@ def write_obj_triangles(
 ) -> None:
     """Write triangles to an OBJ file, with all digits of their type; see `formats.write_triangles`."""
     warn_of_losses(path, {f'attribute "{name}"': True for name in attributes})
-    with whole_file(Path(path)) as beside, beside.open("w", encoding="ascii", newline="\n") as stream:
+    from ..whole_file import whole_file
+
+    with whole_file(path) as beside, beside.open("w", encoding="ascii", newline="\n") as stream:
         stream.write(f"# {len(positions)} vertices, {len(triangles)} triangles\n")
         for keyword, values in (("v", positions), ("vt", texcoords), ("vn", normals)):
             if values is not None:

@@ -330,7 +330,7 @@ def write_polygons(
     is_size[ragged.starts(lengths)[:, None] + np.arange(sizes.itemsize)] = True
     faces = np.empty(len(is_size), dtype=np.uint8)
     faces[is_size], faces[~is_size] = sizes.view(np.uint8), numbers.view(np.uint8)
-    with whole_file(Path(path)) as beside, beside.open("wb") as stream:
+    with whole_file(path) as beside, beside.open("wb") as stream:
         stream.write("\n".join(header).encode("ascii"))
         stream.write(vertices.tobytes())
         stream.write(faces.tobytes())

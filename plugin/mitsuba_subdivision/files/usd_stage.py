@@ -6,16 +6,18 @@ else the first sample. USD itself takes the sample first, and takes the schema's
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..cage.contents import Interpolation
 from ..cage.errors import CageError, shortened, warn
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from pxr import Gf, Sdf, Usd, UsdGeom
 
 # Attributes of a mesh that are rules of a cage. Chaikin's rule has none.
@@ -55,7 +57,7 @@ def open_stage(
     completed: Callable[[Usd.Stage, str], Usd.Stage] | None = None,
 ) -> Usd.Stage:
     """Open the stage of a file, with everything that it refers to. Warns if something of it is not there."""
-    with Path(path).open("rb"):
+    with open(path, "rb"):
         pass  # So that a missing file is an OSError, as for other formats.
     name = f'"{path}"'
     require_usd(name)
@@ -68,7 +70,7 @@ def open_stage(
                 stage = completed(stage, name)
         except Tf.ErrorException as error:
             reason = _commentary(error)
-            where = re.match(re.escape(str(Path(path).absolute())) + r":(\d+):\d+: ", reason)
+            where = re.match(re.escape(os.path.abspath(path)) + r":(\d+):\d+: ", reason)
             if where:
                 # The parser names the rules of its grammar, which are in C++.
                 what = re.sub("parse error matching .* at ", "syntax error at ", reason[where.end() :], flags=re.DOTALL)
@@ -82,7 +84,7 @@ def _warn_of_missing(name: str, errors: list[str]) -> None:
     """Warn of assets that a stage refers to and that could not be opened, in one line for each kind."""
     documents = [match[1] for match in map(_MATERIALX.search, errors) if match]
     if documents:
-        files = _listed(sorted({Path(document).name for document in documents}), 3)
+        files = _listed(sorted({os.path.basename(document) for document in documents}), 3)
         count = f"{len(documents)} references" if len(documents) > 1 else "a reference"
         warn(
             f"{name}: {count} to MaterialX documents left out, which usd-core cannot open ({files}); prims without "

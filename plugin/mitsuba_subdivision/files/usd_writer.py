@@ -77,7 +77,7 @@ def _new_mesh(
     require_usd(f'"{path}"', "writes")
     from pxr import Tf, Usd, UsdGeom
 
-    with whole_file(Path(path)) as beside:
+    with whole_file(path) as beside:
         try:
             stage = Usd.Stage.CreateNew(str(beside))
             mesh = UsdGeom.Mesh.Define(stage, f"/{name}")

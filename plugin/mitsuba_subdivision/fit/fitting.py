@@ -158,7 +158,7 @@ class Fit(ABC):
         """
         arrays: dict[str, Any] = {"format": FORMAT, "losses": self.losses}
         arrays.update(refinements=self.refinements, since=self._since, **self._state())
-        with whole_file(Path(path)) as unfinished, unfinished.open("wb") as file:
+        with whole_file(path) as unfinished, unfinished.open("wb") as file:
             np.savez(file, **arrays)
 
     def resume(self, path: str | Path) -> Self:

@@ -303,7 +303,7 @@ def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: 
     if metadata:
         # JSON, as OpenEXR would round Python's numbers to 32 bits.
         header[METADATA_ATTRIBUTE] = json.dumps(metadata, sort_keys=True)
-    with whole_file(Path(path)) as beside, OpenEXR.File(header, converted) as file:
+    with whole_file(path) as beside, OpenEXR.File(header, converted) as file:
         file.write(str(beside))
 
 
