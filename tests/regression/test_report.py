@@ -45,7 +45,7 @@ def reports(same, failed, tmp_path_factory):
         patch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
         pages = [write_report(folder / "a", same, "unchanged")]
         patch.setattr(Figure, "savefig", lambda *given, **more: figures.append(given[0]) or save(*given, **more))
-        pages.append(write_report(folder / "b", failed, "changed"))
+        pages.append(write_report(folder / "b", failed, "changed <2>"))
     return list(zip(pages, map(by_title, figures), strict=True))
 
 
@@ -71,6 +71,7 @@ def test_the_page_has_one_picture_runs_nothing_escapes_names_and_lies_beside_its
     assert re.findall(r"<(script|img)\b", text) == ["img"]
     assert re.findall(r"""\b(?:href|src)=["']?(?!data:)([^"' >]+)""", text) == ["comparison.json", "maps.exr"]
     assert "test &lt;1&gt;" in text
+    assert text.count("changed &lt;2&gt;") == 2
     numbers = json.loads((page.parent / "comparison.json").read_text())
     assert numbers["status"] == "fail"
     assert numbers["tiers"]["tile"]["failing"]
@@ -78,7 +79,7 @@ def test_the_page_has_one_picture_runs_nothing_escapes_names_and_lies_beside_its
     assert np.abs(channels["z"][8:16, 8:16]).mean() > 5 * np.abs(channels["z"][20:, 20:]).mean()
     # The index lists failures first.
     index = write_index(page.parent.parent).read_text()
-    assert index.index("changed") < index.index("unchanged")
+    assert index.index("changed &lt;2&gt;") < index.index("unchanged")
     assert 'href="b/index.html"' in index
 
 
