@@ -42,7 +42,7 @@ def test_the_unit_of_length_does_not_matter(np_rng):
     for unit in (2.0**-30, 2.0**30, 2.0**-10):
         there = LimitSurface(cage.with_positions(unit * cage.positions))
         assert there.area() == unit**2 * here.area()
-    np.testing.assert_array_equal(there.sample(100, 3).uv, here.sample(100, 3).uv)
+        np.testing.assert_array_equal(there.sample(100, 3).uv, here.sample(100, 3).uv)
     np.testing.assert_array_equal(there.closest_point(unit * points).uv, here.closest_point(points).uv)
     np.testing.assert_allclose(there.stiffness().data, here.stiffness().data, rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(unit**2 * there.bending().data, here.bending().data, rtol=1e-9, atol=1e-12)

@@ -70,7 +70,7 @@ class BernsteinBasis:
 
     def coefficients(self, values_at_sites: FloatArray) -> FloatArray:
         """Return ``(.., b, n)`` coefficients of the polynomials with values ``(.., b, n)`` at ``indices / degree``."""
-        return _clean(self._from_values @ values_at_sites)
+        return self._from_values @ values_at_sites
 
     @cached_property
     def halves(self) -> FloatArray:
@@ -79,7 +79,7 @@ class BernsteinBasis:
         The order and the parameters are those of `ParameterDomain.children`.
         """
         sites = [child.inverse()(self._sites) for child in self.domain.children]
-        return self.coefficients(np.stack([self.values(child_sites) for child_sites in sites]))
+        return _clean(self.coefficients(np.stack([self.values(child_sites) for child_sites in sites])))
 
     @cached_property
     def derivatives(self) -> FloatArray:
@@ -122,7 +122,7 @@ def times(rows: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def _clean(matrix: FloatArray) -> FloatArray:
-    """Replace rounding errors by zeros."""
+    """Replace rounding errors of a matrix, whose entries are fractions of small integers, by zeros."""
     return np.where(np.abs(matrix) < NO_ENTRY, 0, matrix)
 
 
@@ -148,7 +148,7 @@ class PolynomialBasis:
     def of_controls(self) -> FloatArray:
         """``(b, R)`` float64: Bernstein coefficients over a regular patch's control points."""
         of_monomials = self.bernstein.coefficients(self.monomials(self.bernstein.indices / self.bernstein.degree))
-        return _clean(of_monomials @ self.matrix)
+        return _clean(_clean(of_monomials) @ self.matrix)
 
     def monomials(self, uv: FloatArray) -> FloatArray:
         """Return ``(s, m)`` values of the monomials at ``(s, 2)`` parameters."""
