@@ -119,8 +119,9 @@ def test_points_above_places_at_and_next_to_extraordinary_ones(name, np_rng):
     uv = deep * (np_rng.dirichlet(np.ones(domain.corner_count), len(deep)) @ domain.corners)
     element = 0 if surface.scheme.element == "face" else int(np.argmax(surface.patches.elements.face_sizes != 4))
     samples = surface.evaluate(element, uv)
-    for height in (0.0, 1e-12, 1e-6, 1e-3):
-        assert (surface.closest_point(samples.p + height * samples.n).distance <= height + ROUNDED).all()
+    heights = np.repeat([0.0, 1e-12, 1e-6, 1e-3], len(uv))
+    points = np.tile(samples.p, (4, 1)) + heights[:, None] * np.tile(samples.n, (4, 1))
+    assert (surface.closest_point(points).distance <= heights + ROUNDED).all()
 
 
 def test_creases_are_found(np_rng):
