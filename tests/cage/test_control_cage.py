@@ -1,6 +1,7 @@
 """Cages of arrays, files and attributes, their contents, edges, triangles and Laplacian; and named ones."""
 
 import dataclasses
+from functools import cached_property
 
 import mitsuba
 import numpy as np
@@ -69,11 +70,16 @@ class NamedCage(ControlCage):
 
     label: str = "none"
 
+    @cached_property
+    def middle(self):
+        return self.positions.mean(axis=0)
+
 
 def test_new_positions_keep_the_class_and_the_topology_and_nothing_that_was_cached():
     cage = NamedCage.from_arrays(cube().positions, cube().topology.face_sizes, cube().face_vertices)
     given = set(vars(cage))
     assert len(cage.cut_mesh.topology.face_sizes) == 6
+    np.testing.assert_array_equal(cage.middle, 0)
     moved = cage.with_positions(2 * cage.positions)
     assert type(moved) is NamedCage
     assert moved.label == "none"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, fields
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -308,8 +307,11 @@ class ControlCage:
             raise CageError(
                 f"{self.source.name}: {len(validated)} new positions; expected {self.vertex_count}, one per vertex"
             )
-        cage = copy(self)
-        vars(cage)["positions"] = validated
+        cage = type(self).__new__(type(self))
+        # Without what a derived class has cached.
+        names = {attribute.name for attribute in fields(self)}
+        values = {name: value for name, value in vars(self).items() if name in names}
+        vars(cage).update(values, positions=validated)
         return cage
 
     def refined(self, scheme: str | Scheme | None = None) -> ControlCage:

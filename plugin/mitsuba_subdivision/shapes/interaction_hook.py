@@ -66,7 +66,8 @@ _ANSWERED_UV, _VALUE = (8, 9), (10, 11, 12)
 _ATTRIBUTES = {"face_one": 1, "face_three": 3}
 
 # Hooks by variant. Never removed, because shapes use the functions for their whole lifetime.
-_hooks: dict[Variant, InteractionHook] = {}
+# Hooks of variants, or reasons for which these have none: the trial takes a tenth of a second.
+_hooks: dict[Variant, InteractionHook | str] = {}
 # Mitsuba constructs the shapes of a scene in parallel.
 _lock = threading.Lock()
 
@@ -103,8 +104,8 @@ def exact_shading_problem(
 def interaction_hook(variant: Variant) -> InteractionHook:
     """Return the hook of a variant's shapes, created for the first of them.
 
-    Raises RuntimeError if the hook does not exist yet and another variant is set: Mitsuba would create the shape group
-    that the hook needs in that variant.
+    Raises RuntimeError as `InteractionHook`, or if the hook does not exist yet and another variant is set: Mitsuba
+    would create the shape group that the hook needs in that variant.
     """
     with _lock:
         if variant not in _hooks:
@@ -114,8 +115,14 @@ def interaction_hook(variant: Variant) -> InteractionHook:
                     f'the first shape with exact shading in "{name}" was made while {current} was set; expected '
                     f'mi.set_variant("{name}") before, or the shading "vertex"'
                 )
-            _hooks[variant] = InteractionHook(variant)
-        return _hooks[variant]
+            try:
+                _hooks[variant] = InteractionHook(variant)
+            except RuntimeError as error:
+                _hooks[variant] = str(error)
+        hook = _hooks[variant]
+    if isinstance(hook, str):
+        raise RuntimeError(hook)
+    return hook
 
 
 class TriangleHit(NamedTuple):
