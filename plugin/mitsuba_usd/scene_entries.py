@@ -28,7 +28,7 @@ from mitsuba_subdivision.cage import (
     same_topology,
     without_warnings,
 )
-from mitsuba_subdivision.mesh import IntArray, ragged
+from mitsuba_subdivision.mesh import triangle_corners
 from mitsuba_subdivision.messages import counted
 from mitsuba_subdivision.mitsuba_mesh import PolygonMesh, box_corners, points_at
 from mitsuba_subdivision.schemes import SchemeError
@@ -252,7 +252,8 @@ def as_polygons(shape: ShapeContents) -> ShapeContents:
 def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
     """Triangles of a shape that is not to be subdivided."""
     cage, normals = shape.cage, shape.normals
-    corners = _triangles(cage)
+    corners, face = triangle_corners(cage.positions, cage.face_sizes, cage.face_vertices)
+    corners = corners[~np.isin(face, cage.holes)]
     data: dict[str, Attribute] = dict(cage.attributes)
     if cage.texcoords is not None:
         data["texcoords"] = cage.texcoords
@@ -272,16 +273,6 @@ def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
     for name, attribute in data.items():
         vertices[f"vertex_{name}"] = attribute.values[vertex if attribute.indices is None else attribute.indices]
     return PolygonMesh(shape.name, triangles, vertices)
-
-
-def _triangles(cage: CageContents) -> IntArray:
-    """Face corners of triangles that fan out from the first corners of the faces, ``(n, 3)``."""
-    sizes = cage.face_sizes.copy()
-    first = np.cumsum(sizes) - sizes
-    sizes[cage.holes] = 0
-    counts = np.maximum(sizes - 2, 0)
-    second = ragged.ranges(first + 1, counts)
-    return np.stack([np.repeat(first, counts), second, second + 1], axis=1)
 
 
 class LoadedShapes:

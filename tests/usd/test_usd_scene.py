@@ -951,6 +951,18 @@ def test_polygons_have_their_normals_and_holes(scene):
     assert (np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, 2] > 0).all()
 
 
+def test_polygons_with_a_notch_are_not_filled(scene):
+    notched = f"""{POLYGONS}
+        point3f[] points = [(-1,-1,0), (1,-1,0), (1,1,0), (-1,1,0), (0.5,0,0)]
+        int[] faceVertexCounts = [5]
+        int[] faceVertexIndices = [0, 1, 2, 3, 4]"""
+    p = triangles(scene(mesh("notched", notched))["notched"])
+    areas = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])[:, 2] / 2
+    # Two units by two, without the triangle from the left side to the notch.
+    np.testing.assert_allclose(np.abs(areas).sum(), 4 - 1.5, rtol=1e-6)
+    assert len(p) == 3
+
+
 @pytest.mark.parametrize("kind", ["Cube", "Sphere", "Cylinder", "Cone", "Capsule", "Plane"])
 def test_shapes_without_a_mesh_have_their_extent_and_face_outwards(stage, kind):
     from pxr import Usd, UsdGeom

@@ -14,6 +14,7 @@ from ..device_arrays import mapped
 from ..mesh.connectivity import CreaseMethod, IndexArray, IntArray, Topology
 from ..mesh.cuts import CutMesh, SharpMesh, Sharpness
 from ..mesh.manifold import NonManifold
+from ..mesh.triangulation import triangle_corners
 from ..variants import variant_module
 from .contents import RULES, Attribute, CageContents, validated_attribute
 from .errors import CageError, CageSource
@@ -401,8 +402,11 @@ class ControlCage:
 
     @property
     def triangles(self) -> IndexArray:
-        """``(n, 3)`` int32, 0-based vertices of the triangle fan at the first vertex of each face; read-only."""
-        return self.topology.triangles
+        """``(n, 3)`` int32, 0-based vertices of triangles that cover the faces, in order of faces; read-only."""
+        corners, _ = triangle_corners(self.positions, self.face_sizes, self.face_vertices)
+        triangles: IndexArray = self.face_vertices[corners]
+        triangles.flags.writeable = False
+        return triangles
 
     def laplacian(self) -> sparse.csr_array:
         """Return the uniform Laplacian of the cage's edges, ``(n_v, n_v)`` CSR array of float64.

@@ -2,5 +2,6 @@
 
 from . import ragged
 from .connectivity import IntArray, Topology
+from .triangulation import triangle_corners
 
-__all__ = ["IntArray", "Topology", "ragged"]
+__all__ = ["IntArray", "Topology", "ragged", "triangle_corners"]

@@ -250,16 +250,6 @@ class Topology:
         return ends
 
     @cached_property
-    def triangles(self) -> IndexArray:
-        """``(n, 3)`` vertices of the triangle fans at the first vertex of each face, in order of faces. Read-only."""
-        counts = self.face_sizes - 2
-        first = np.repeat(self.face_offsets[:-1], counts)
-        step = first + ragged.index_in_row(counts)
-        triangles = self.face_vertices[np.stack([first, step + 1, step + 2], axis=1)]
-        triangles.flags.writeable = False
-        return triangles
-
-    @cached_property
     def vertex_half_edge(self) -> IndexArray:
         """``(n_v,)`` lowest outgoing half-edge of each vertex, -1 if no face uses the vertex."""
         return first_indices(self.face_vertices, self.vertex_count)
