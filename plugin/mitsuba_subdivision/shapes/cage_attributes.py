@@ -23,7 +23,7 @@ from ..device_arrays import mapped, upload
 from ..kernels.array_types import Float, FloatBuffer, Index, Value
 from ..mesh.shared import Content, SharedArray, shared
 from ..variants import Variant
-from .derivatives import computed_ones, warn_of_lost, watched
+from .derivatives import BackwardPasses
 from .device_state import flat_type, require_values
 from .parameter_table import errors_about
 
@@ -94,7 +94,11 @@ class CageAttributes:
         self._upsampling = spectral_upsampling(variant, sizes)
         # Updated values of attributes, as watched for reverse-mode passes.
         self._moved: dict[str, FloatBuffer] = {}
-        self._computed: dict[str, set[int]] = {}
+        # Older than any values of the parameters that are differentiated.
+        self._passes = {
+            name: BackwardPasses(self._source, f"{PREFIX}{name}", variant.Float)
+            for name in (self._channels if dr.is_diff_v(variant.Float) else ())
+        }
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose the parameters."""
@@ -125,14 +129,14 @@ class CageAttributes:
                 require_values(self.values[f"{PREFIX}{name}"], len(channel.values), channel.values.shape[1], "value")
         for name in channels:
             values = self.values[f"{PREFIX}{name}"]
-            self._computed[name] = computed_ones(values) if dr.grad_enabled(values) else set()
+            if dr.grad_enabled(values):
+                self._passes[name].begin([values])
             self._move(name)
         return list(channels)
 
     def renew(self, name: str, gradient: FloatBuffer) -> None:
         """Attach an attribute's followers and buffers to its values again, after reverse mode has reached these."""
-        parameter = f"{PREFIX}{name}"
-        warn_of_lost(self._source, parameter, [self.values[parameter]], self._computed[name], [gradient])
+        self._passes[name].warn_of_lost([gradient])
         self._move(name)
 
     def buffers(self, names: Iterable[str] | None = None) -> dict[str, FloatBuffer]:
@@ -176,7 +180,7 @@ class CageAttributes:
     def _move(self, name: str) -> None:
         values = self.values[f"{PREFIX}{name}"]
         if dr.grad_enabled(values):
-            values = watched({name: values}, self._on_backward, name)[name]
+            values = self._passes[name].watched({name: values}, self._on_backward, name)[name]
         self._moved[name] = values
         if name in self._followers:
             self._followers[name](values)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
-from weakref import WeakMethod
+from weakref import WeakMethod, ref
 
 import drjit as dr
 import mitsuba as mi
@@ -14,44 +14,92 @@ from ..kernels.array_types import Float
 from ..kernels.linear_maps import attached
 from .device_state import is_recording
 
-# Number of bits of a Dr.Jit variable index. The index of its derivative is in the bits above.
-_HALF = 32
+
+class BackwardPasses:
+    """Follows gradients to parameters of a shape, and warns when they cannot go on to what these were computed from.
+
+    Dr.Jit forgets how a variable was computed once a gradient has passed through it. It processes variables from the
+    newest to the oldest, and then keeps gradients of those alone that were not computed. So a probe, a variable older
+    than the parameters, finds in the first pass after an update which parameters were computed.
+    """
+
+    def __init__(
+        self,
+        name: str,  # Of the shape, in messages
+        parameters: str,  # Their names
+        float_type: type,  # Flat Dr.Jit array
+    ) -> None:
+        self._name, self._parameters, self._float = name, parameters, float_type
+        self._sources: list[Any] = []
+        self._is_lost = False
+        self._probe, self._next = None, self._made()
+
+    def begin(
+        self,
+        sources: Iterable[Any],  # Values of the parameters
+    ) -> None:
+        """Begin with updated parameters, which are differentiated."""
+        self._sources, self._is_lost = [source for source in sources if dr.grad_enabled(source)], False
+        self._probe, self._next = self._next, self._made()
+
+    def watched(
+        self,
+        arrays: dict[str, Any],  # Differentiated, computed from the parameters
+        method: WeakMethod,  # Weak, as the arrays must not keep the shape alive
+        *arguments: Any,
+    ) -> dict[str, Any]:
+        """Return the same arrays. A method is called with gradients by name after reverse mode has passed them."""
+
+        def backward(*gradients: Any) -> tuple:
+            call = method()
+            if call is not None:
+                call(*arguments, dict(zip(arrays, gradients, strict=True)))
+            return (*gradients, 0)
+
+        given = tuple(arrays.values())
+        detached, probe = tuple(map(dr.detach, given)), self._float(0) if self._probe is None else self._probe
+        through = attached(detached, (*given, probe), lambda changes: changes[: len(given)], backward)
+        self._probe = None
+        return dict(zip(arrays, through, strict=True))
+
+    def warn_of_lost(
+        self,
+        gradients: Iterable[Any],  # Zero for shapes of scenes that are no longer used
+    ) -> None:
+        """Warn if gradients have come to parameters, but not to the variables that they were computed from."""
+        is_lost = self._is_lost and not is_recording()
+        if is_lost and any(dr.any(gradient != 0, axis=None) for gradient in gradients):
+            warn(
+                f"{self._name}: gradients came to {self._parameters} a second time since the last update, and could "
+                "not go on to the variables that these were computed from, as Dr.Jit forgets a computation once "
+                "gradients have passed through it; assign the parameters and update before each view, or differentiate "
+                "one loss of all views, as loss_of_views computes it"
+            )
+
+    def _made(self) -> Any:
+        """Make a probe for the next update."""
+        if is_recording():
+            return None
+        reference = ref(self)
+
+        def backward(_gradient: Any) -> Any:
+            passes = reference()
+            if passes is not None:
+                passes._is_lost = not all(map(_has_gradient, passes._sources))
+            return 0
+
+        start = self._float(0)
+        dr.enable_grad(start)
+        return attached(self._float(0), start, lambda change: change, backward)
 
 
-def watched(
-    arrays: dict[str, Any],  # Differentiated
-    method: WeakMethod,  # Weak, as the arrays must not keep the shape alive
-    *arguments: Any,
-) -> dict[str, Any]:
-    """The same arrays. Calls a method with gradients by name after reverse mode has passed through them."""
-
-    def backward(*gradients: Any) -> tuple:
-        call = method()
-        if call is not None:
-            call(*arguments, dict(zip(arrays, gradients, strict=True)))
-        return gradients
-
-    given = tuple(arrays.values())
-    through = attached(tuple(map(dr.detach, given)), given, lambda changes: changes, backward)
-    return dict(zip(arrays, through, strict=True))
-
-
-def warn_of_lost(
-    name: str,
-    parameters: str,
-    arrays: Iterable[Any],  # Of the parameters
-    computed: set[int],  # Their `computed_ones` at the last update
-    gradients: Iterable[Any],  # Zero for shapes of scenes that are no longer used
-) -> None:
-    """Warn if a gradient has reached parameters of a shape, but not the variables that they were computed from."""
-    is_lost = bool(computed - computed_ones(*arrays)) and not is_recording()
-    if is_lost and any(dr.any(gradient != 0, axis=None) for gradient in gradients):
-        warn(
-            f"{name}: gradients came to {parameters} a second time since the last update, and could not go on to the "
-            "variables that these were computed from, as Dr.Jit forgets a computation once gradients have passed "
-            "through it; assign the parameters and update before each view, or differentiate one loss of all views, "
-            "as loss_of_views computes it"
-        )
+def _has_gradient(variable: Any) -> bool:
+    """Whether a variable has a gradient: Dr.Jit returns literal zeros if it has none."""
+    if dr.is_tensor_v(variable):
+        variable = variable.array
+    if dr.depth_v(variable) > 1:
+        return any(map(_has_gradient, variable))
+    return dr.grad(variable).state != dr.VarState.Literal
 
 
 def loss_of_views(
@@ -100,16 +148,3 @@ def loss_of_views(
         loss(render(scene, params, sensor=sensor, seed=seed * len(sensors) + view, **options), view)
         for view, sensor in enumerate(sensors)
     )
-
-
-def computed_ones(*values: Any) -> set[int]:
-    """Find arrays whose derivatives depend on other variables in Dr.Jit's graph.
-
-    A variable whose gradient was enabled directly has no such dependence, nor has an array after a gradient has passed
-    through its computation, which Dr.Jit then removes by default.
-
-    Returns set of int: Dr.Jit's indices of the arrays' derivatives.
-    """
-    derivatives = {index >> _HALF for value in values for index in dr.detail.collect_indices(value)} - {0}
-    graph = str(dr.graphviz_ad(as_string=True))
-    return {index for index in derivatives if f" {index} -> " in graph}

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..device_arrays import mapped
-from ..kernels.array_types import ArrayTypes, FloatBuffer, IndexBuffer, LaterArrays, Matrix4
+from ..kernels.array_types import ArrayTypes, FloatBuffer, IndexBuffer, LaterArrays
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, Shared, SharedArray, shared
 from ..surface import LimitSurface
 from ..variants import Variant
-from .derivatives import computed_ones, warn_of_lost, watched
+from .derivatives import BackwardPasses
 from .placement import Placement
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class MeshBuffers:
 
     Dr.Jit removes a computation from its graph once a gradient has passed backwards through it. So the arrays must be
     `attached` to the parameters again before the gradient of another view. If the parameters were themselves computed
-    from other variables, that computation is lost: gradients end at the parameters, and `warn_of_lost` warns.
+    from other variables, that computation is lost: gradients end at the parameters, and `BackwardPasses` warns.
     """
 
     def __init__(
@@ -64,7 +64,9 @@ class MeshBuffers:
         self._is_sampled = parameters.evaluator != "stabilized" or parameters.sample_offset > 0
         # Whether vertices are differentiable with respect to control points, placement and displacement.
         self.are_differentiable = not self._is_sampled and dr.is_diff_v(variant.Float)
-        self._computed: set[int] = set()
+        if self.are_differentiable:
+            names = "control_points or to_world" if displacement is None else "control_points, to_world or heights"
+            self.passes = BackwardPasses(parameters.source, names, variant.Float)
         self._evaluated: tuple[FloatBuffer, FloatBuffer] | None = None
 
     def set_triangles(
@@ -106,7 +108,8 @@ class MeshBuffers:
             surface.values.attach(points)
         sources = self._sources(control_points)
         moves = self.are_differentiable and dr.grad_enabled(*sources)
-        self._computed = computed_ones(*sources) if moves else set()
+        if moves:
+            self.passes.begin(sources)
         # Free the memory of the last evaluation before the next one.
         self._evaluated = None
         if self._kernel is None:
@@ -125,16 +128,6 @@ class MeshBuffers:
         if self._kernel is None or self._evaluated is None:
             raise RuntimeError("vertices were not kept; expected an evaluation with derivatives before")
         return self._placed(*self._kernel.attached(points, *self._evaluated), points)
-
-    def warn_of_lost(
-        self,
-        gradients: dict[str, FloatBuffer | Matrix4],  # By the arrays computed from the parameters, by name
-        control_points: FloatBuffer,
-    ) -> None:
-        """Warn if a gradient has reached the parameters, but not the variables that these were computed from."""
-        names = "control_points or to_world" if self._displacement is None else "control_points, to_world or heights"
-        sources = self._sources(control_points)
-        warn_of_lost(self._parameters.source, names, sources, self._computed, gradients.values())
 
     def _sources(self, control_points: FloatBuffer) -> list:
         """Arrays that vertices depend on."""
@@ -178,7 +171,7 @@ class MeshBuffers:
         if self.are_differentiable:
             attached = {name: array for name, array in moved.items() if dr.grad_enabled(array)}
             if attached:
-                moved |= watched(attached, self._on_backward)
+                moved |= self.passes.watched(attached, self._on_backward)
         if shading is not None:
             shading.set_transform(moved.pop("to_world"), moved.pop("coefficients"), placement)
         return moved

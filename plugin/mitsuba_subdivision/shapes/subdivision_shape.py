@@ -254,7 +254,7 @@ def make_subdivision(
             gradients: dict[str, FloatBuffer | Matrix4],  # Gradient by each array computed from the parameters
         ) -> None:
             """Attach the moving arrays to the parameters again, without evaluating them; see `MeshBuffers`."""
-            self._mesh.warn_of_lost(gradients, self.control_points)
+            self._mesh.passes.warn_of_lost(gradients.values())
             if dr.grad_enabled([self._cage.values[name] for name in self._cage.moving]):
                 # `renew_attribute` receives the gradients next. Attaching vertices twice in one pass crashes Dr.Jit.
                 return
