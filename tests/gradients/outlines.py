@@ -1,10 +1,12 @@
 """Pictures of outlines, and what triangles cover of them: areas by scan lines, without any renderer."""
 
+import mitsuba as mi
 import numpy as np
 from gradients.surfaces import ALL
 from kernels.surfaces import CAGES
-from mitsuba_subdivision import ControlCage, LimitSurface
-from shapes.cages import described
+from mitsuba_subdivision import ControlCage, LimitSurface, upload
+from patches.closed_cages import bumpy
+from shapes.cages import RING, cube, described
 from shapes.scenes import perspective, scene_with
 
 EYE, TARGET, UP, FOV = (1, -5, 2), (0, 0, 0), (0, 0, 1), 40
@@ -19,6 +21,62 @@ SURFACES = {
     "concave, doo_sabin": lambda: LimitSurface(ControlCage.from_file(STAR), "doo_sabin"),
     **{name: ALL[name] for name in ("creased", "semi-sharp", "open")},
 }
+
+
+def bumpy_cube(**tags):
+    return bumpy(cube(**tags).refined())
+
+
+def dome():
+    """The bumpy cube without its top."""
+    cage = bumpy_cube()
+    faces = cage.face_vertices.reshape(-1, 4)
+    return ControlCage(cage.positions, faces[cage.positions[faces, 2].mean(axis=1) < 0.7])
+
+
+LIT_CAGES = {
+    "cube": lambda: cube().refined(),
+    "bumpy": bumpy_cube,
+    "open": dome,
+    "creased": lambda: bumpy_cube(creases=RING),
+}
+CAMERA = (1.2, -3.6, 1.2)
+LIGHTS = {
+    "camera": {"type": "directional", "direction": np.negative(CAMERA).tolist(), "irradiance": 3.0},
+    "side": {"type": "directional", "direction": [-1, 0.6, -0.4], "irradiance": 3.0},
+    "around": {"type": "constant"},
+    "lamp": {"type": "sphere", "center": [3, -4, 3], "emitter": {"type": "area", "radiance": 40.0}},
+}
+DIFFUSE = {"type": "diffuse"}
+COLOURED = {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}}
+BOTH_SIDES = {"type": "twosided", "bsdf": DIFFUSE}
+ROUGH = {"type": "roughconductor", "alpha": 0.3}
+# Cage, light, material, rate, integrator, sizes, and parameters: of lit surfaces that no shadow falls on.
+LIT = {
+    "lit from the camera": ("cube", "camera", DIFFUSE, 2, "direct_projective", [1, 1, 1], {}),
+    "coloured, mirrored": ("bumpy", "side", COLOURED, 2, "prb_projective", [-1, 1, 1], {}),
+    # Triangles are longer than 1.
+    "flipped, large": ("bumpy", "side", BOTH_SIDES, 2, "prb_projective", [100, 100, 100], {"flip_normals": True}),
+    "rough below a lamp": ("cube", "lamp", ROUGH, 4, "direct_projective", [1, 1, 1], {}),
+    "open": ("open", "side", BOTH_SIDES, 4, "direct_projective", [1, 1, 1], {}),
+    "creased": ("creased", "side", DIFFUSE, 2, "prb_projective", [1, 1, 1], {}),
+    "lit from around": ("cube", "around", DIFFUSE, 12, "direct_projective", [1, 1, 1], {}),
+}
+
+
+def lit(name, light, bsdf, rate, integrator, sizes, parameters):
+    """A scene of an exactly shaded surface, and the positions of its cage."""
+    cage = LIT_CAGES[name]()
+    if bsdf is COLOURED:
+        colours = np.random.default_rng(0).random((cage.vertex_count, 3))
+        parameters = {"vertex_colour": upload(mi.TensorXf, colours), **parameters}
+    to_world = mi.ScalarTransform4f().scale(sizes)
+    shape = described(cage, to_world=to_world, tessellation_rate=rate, shading="exact", bsdf=bsdf, **parameters)
+    depth = {"max_depth": 2} if integrator.startswith("prb") else {}
+    seen = {"integrator": {"type": integrator, "sppi": 0, **depth}, "light": LIGHTS[light]}
+    sampler = {"type": "stratified", "sample_count": 64}
+    seen["sensor"] = perspective(64, np.multiply(CAMERA, sizes[1]), fov=FOV, sampler=sampler)
+    return scene_with(**seen, shape=shape), cage.positions
 
 
 def outline(shape, *, emits=False, resolution=32):

@@ -22,6 +22,7 @@ from ..mesh.shared import shared
 from ..surface import TEXCOORDS
 from ..variants import Variant
 from .cage_attributes import WIDTHS, mesh_name, spectral_upsampling
+from .outlines import turn_to_seen
 from .placement import Placement
 
 if TYPE_CHECKING:
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from .interaction_hook import TriangleHit
     from .parameters import Parameters
 
+# Length of the rays to points of outlines, in which projective integrators compute the radiance beside these.
+OUTLINE = 1
 # Cosine of the angle between a ray and the normals that `_facing` turns to a silhouette.
 GRAZING = 1e-2
 # Tolerance when comparing texture coordinates, or parameters, of a location.
@@ -131,13 +134,13 @@ class ExactShading:
         ray_direction = vector3(dr.detach(ray.d))
         d = self._map.inverse_direction(ray_direction)
         location = self._located(preliminary.prim_index, b1, b2, active)
+        # Integrators begin the rays to outlines at a distance of `OUTLINE`, wherever the sensor is.
+        length = dr.select(preliminary.t == OUTLINE, dr.inf, dr.detach(si.t))
         # Limit the search to the triangle's size, and to the length of the ray, whose origin is in front of the
         # surface. Both are lengths in world space along the ray, converted to object space.
         sides = vector3(dr.detach(si.dp_du)), vector3(dr.detach(si.dp_dv))
         size = dr.maximum(*(dot(side, side) for side in sides))
-        farthest = dr.minimum(dr.sqrt(size * dr.rcp(dot(ray_direction, ray_direction))), dr.detach(si.t)) * dr.sqrt(
-            dot(d, d)
-        )
+        farthest = dr.minimum(dr.sqrt(size * dr.rcp(dot(ray_direction, ray_direction))), length) * dr.sqrt(dot(d, d))
         facing = dot(vector3(dr.detach(si.n)), ray_direction)
         limits = {"max_distance": farthest, "facing": facing * self._sign}
         location, kind, values = kernel.line_hits(hit, d, location, active, **limits)
@@ -202,6 +205,10 @@ class ExactShading:
             location = self.kernel.at(location, active, constraint=lines).location
         value = self._attributes[name](location, active)[0]
         return self._upsampling[name](value) if name in self._upsampling else value
+
+    def turn_outline(self, ss: mi.SilhouetteSample3f, active: Mask) -> None:
+        """Move a sample of the shape's outline to the triangle that is seen, in place."""
+        turn_to_seen(cast("mi.Mesh", self._shape()), ss, active)
 
     def hit_by_texcoords(
         self,
@@ -289,7 +296,7 @@ class ExactShading:
         # Otherwise, rays leave on the side that they came from. They start on the surface or on the triangle, whichever
         # is in front, so that no triangle occludes them.
         t = dot(points.p - o, d) / dot(d, d)
-        is_before &= t > 0
+        is_before &= (t > 0) | (si.t == OUTLINE)
         si.p, si.t = dr.select(is_before, variant.Point3f(points.p), si.p), dr.select(is_before, t, si.t)
         si.n = n
 

@@ -55,6 +55,7 @@ _INTERACTION_ARGUMENTS = (
     rf"mitsuba::Ray<.*> const&, mitsuba::PreliminaryIntersection<.*> const&, unsigned int, unsigned int, {_MASK}"
 )
 _ATTRIBUTE_ARGUMENTS = rf"std::basic_string_view<.*>, mitsuba::SurfaceInteraction<.*> const&, {_MASK}"
+_OUTLINE_ARGUMENTS = rf"mitsuba::Point<.*> const&, unsigned int, {_MASK}"
 # Bits of the flags argument for the group's tag, and for Mitsuba's ray flags.
 _TAG, _FLAGS = 0xFFFF0000, 0x0000FFFF
 
@@ -153,6 +154,8 @@ class InteractionHook:
         self._tags: WeakKeyDictionary[Any, set[int]] = WeakKeyDictionary()
         triangle = _triangle(variant)
         entries = virtual_functions(table_of(triangle).value or 0)
+        index = _index_of(entries, "sample_silhouette", _OUTLINE_ARGUMENTS)
+        entries[index] = calling_after(entries[index], variant.SilhouetteSample3f, self._turn_outline)
         spectrum = variant.UnpolarizedSpectrum
         index = _index_of(entries, "compute_surface_interaction", _INTERACTION_ARGUMENTS)
         entries[index] = calling_after(entries[index], variant.SurfaceInteraction3f, self._complete)
@@ -172,7 +175,7 @@ class InteractionHook:
     def attach(
         self,
         shape: mi.Mesh,
-        # `ExactShading`, or another object with its methods `complete` and `attribute`; kept alive by the shape. Their
+        # `ExactShading`, or another object with its methods `complete`, `attribute` and `turn_outline`; kept alive by the shape. Their
         # errors propagate to the Python code that called Mitsuba. Their arguments are in memory of C++ and must not be
         # kept.
         answers: Any,
@@ -200,6 +203,13 @@ class InteractionHook:
                 object_at(variant.Mask, active),
             )
             answers.complete(object_at(variant.SurfaceInteraction3f, result), hit)
+
+    def _turn_outline(self, result: int, this: int, _sample: int, _flags: int, active: int, *_: int) -> None:
+        """Override of ``sample_silhouette``, called with its result and its arguments."""
+        answers = self._answers.get(this)
+        if answers is not None:
+            variant = self._variant
+            answers.turn_outline(object_at(variant.SilhouetteSample3f, result), object_at(variant.Mask, active))
 
     def _attribute(self, result_type: type, sizes: set[int]) -> Callable[..., None]:
         """Override of a function that evaluates an attribute, for values whose number of components is in ``sizes``."""
@@ -283,6 +293,11 @@ class Trial:
         self.asked = _identity(name, si.t, active)
         return self._variant.Float(_VALUE[0]) if _ATTRIBUTES[name] == 1 else self._variant.Color3f(*_VALUE)
 
+    def turn_outline(self, ss: mi.SilhouetteSample3f, active: Mask) -> None:
+        """As `ExactShading.turn_outline`."""
+        self.asked = _identity(active)
+        ss.uv = self._variant.Point2f(*_ANSWERED_UV)
+
 
 def trial_problem(
     variant: Variant,
@@ -300,6 +315,7 @@ def trial_problem(
     of_one, of_three = (_identity(name, si.t, active) for name in _ATTRIBUTES)
     for function, arguments, asked, value in (
         (shape.compute_surface_interaction, hit, _asked(hit), variant.Point2f(*_ANSWERED_UV)),
+        (shape.sample_silhouette, (variant.Point3f(*_ORIGIN), 0, active), _identity(active), variant.Point2f(*_ANSWERED_UV)),
         (shape.eval_attribute, ("face_one", si, active), of_one, variant.UnpolarizedSpectrum(_VALUE[0])),
         (shape.eval_attribute_1, ("face_one", si, active), of_one, variant.Float(_VALUE[0])),
         (shape.eval_attribute_3, ("face_three", si, active), of_three, variant.Color3f(*_VALUE)),

@@ -18,6 +18,7 @@ from ..variants import Variant
 from .cage_attributes import PREFIX, CageAttributes, mesh_attributes, mesh_name
 from .device_state import DeviceState, flat_type, is_recording, paused_collection, require_values, traversed
 from .mesh_buffers import MeshBuffers
+from .outlines import seen_edges
 from .parameter_table import errors_about, plugin_page
 from .parameters import Parameters, Tessellation, read_parameters
 from .placement import Placement, checked_matrix
@@ -314,21 +315,10 @@ def make_subdivision(
             self._has_outlines = True
 
         def precompute_silhouette(self, viewpoint: mi.ScalarPoint3f) -> tuple[IndexBuffer, FloatBuffer]:
-            """Half-edges of the outline seen from a point, each in the triangle that is seen, and their weights.
-
-            Integrators take the radiance at an outline from the interaction with this triangle. Mitsuba's own choice
-            is arbitrary, and may be the hidden triangle of the two.
-            """
+            """Half-edges of the outline seen from a point, in the triangles that are seen, and their weights."""
             edges, weights = super().precompute_silhouette(viewpoint)
-            opposite = self.opposite_dedge(edges)
-            has_opposite = opposite < 3 * self.face_count()
-            corners = self.face_indices(edges // 3)
-            a, b, c = (self.vertex_position(corners[i]) for i in range(3))
-            n = dr.cross(b - a, c - a)
-            other = self.face_indices(opposite // 3, has_opposite)
-            offset = sum((self.vertex_position(other[i], has_opposite) for i in range(3))) - 3 * a
-            is_hidden = has_opposite & (dr.dot(n, viewpoint - a) * dr.dot(n, offset) > 0)
-            return dr.select(is_hidden, opposite, edges), weights
+            start = self.vertex_position(self.face_indices(edges // 3)[0])
+            return seen_edges(self, edges, start - viewpoint), weights
 
         def surface_area(self) -> Float:
             """Area of the triangles; differentiable, unlike that of `mi.Mesh`."""
