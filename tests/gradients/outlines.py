@@ -31,13 +31,21 @@ def dome():
     """The bumpy cube without its top."""
     cage = bumpy_cube()
     faces = cage.face_vertices.reshape(-1, 4)
-    return ControlCage(cage.positions, faces[cage.positions[faces, 2].mean(axis=1) < 0.7])
+    kept, faces = np.unique(faces[cage.positions[faces, 2].mean(axis=1) < 0.7], return_inverse=True)
+    return ControlCage(cage.positions[kept], faces.reshape(-1, 4))
+
+
+def inside_out():
+    """The bumpy cube with all faces turned."""
+    cage = bumpy_cube()
+    return ControlCage(cage.positions, cage.face_vertices.reshape(-1, 4)[:, ::-1])
 
 
 LIT_CAGES = {
     "cube": lambda: cube().refined(),
     "bumpy": bumpy_cube,
     "open": dome,
+    "inside out": inside_out,
     "creased": lambda: bumpy_cube(creases=RING),
 }
 CAMERA = (1.2, -3.6, 1.2)
@@ -56,9 +64,9 @@ LIT = {
     "lit from the camera": ("cube", "camera", DIFFUSE, 2, "direct_projective", [1, 1, 1], {}),
     "coloured, mirrored": ("bumpy", "side", COLOURED, 2, "prb_projective", [-1, 1, 1], {}),
     # Triangles are longer than 1.
-    "flipped, large": ("bumpy", "side", BOTH_SIDES, 2, "prb_projective", [100, 100, 100], {"flip_normals": True}),
+    "large, flipped": ("inside out", "side", DIFFUSE, 2, "prb_projective", [100, 100, 100], {"flip_normals": True}),
     "rough below a lamp": ("cube", "lamp", ROUGH, 4, "direct_projective", [1, 1, 1], {}),
-    "open": ("open", "side", BOTH_SIDES, 4, "direct_projective", [1, 1, 1], {}),
+    "open": ("open", "camera", BOTH_SIDES, 4, "direct_projective", [1, 1, 1], {}),
     "creased": ("creased", "side", DIFFUSE, 2, "prb_projective", [1, 1, 1], {}),
     "lit from around": ("cube", "around", DIFFUSE, 12, "direct_projective", [1, 1, 1], {}),
 }

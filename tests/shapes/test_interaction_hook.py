@@ -446,6 +446,8 @@ UNKNOWN = "0 virtual functions {} of the known arguments; expected one"
     [
         ("virtual_functions", lambda *_: [0, 0, 0], UNKNOWN.format("compute_surface_interaction")),
         ("_ATTRIBUTE_ARGUMENTS", "int", UNKNOWN.format("eval_attribute")),
+        ("_OUTLINE_ARGUMENTS", "int", UNKNOWN.format("sample_silhouette")),
+        ("Trial.turn_outline", lambda *_: None, UNHEARD.format("sample_silhouette")),
         ("_INTERACTION_ARGUMENTS", "int", UNKNOWN.format("compute_surface_interaction")),
         ("InteractionHook.attach", lambda *_: None, UNHEARD.format("compute_surface_interaction")),
         ("Trial.complete", hard_of_hearing, UNHEARD.format("compute_surface_interaction")),

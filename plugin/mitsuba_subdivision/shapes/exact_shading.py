@@ -290,13 +290,18 @@ class ExactShading:
         n = _facing(n, dr.detach(d), facing)
         si.sh_frame.n = n
         # Where rays may pass through a material or into a medium, both sides need the same origin: the triangle.
-        transmission = int(mi.BSDFFlags.Transmission)
-        if shape is None or shape.is_medium_transition() or int(shape.bsdf().flags()) & transmission:
+        sides = 0 if shape is None else int(shape.bsdf().flags())
+        if shape is None or shape.is_medium_transition() or sides & int(mi.BSDFFlags.Transmission):
             return
+        is_outline = si.t == OUTLINE
+        if sides & int(mi.BSDFFlags.BackSide):
+            # Integrators replace normals that point away at outlines, as interpolated ones do on the front.
+            n = dr.select(is_outline & (facing > 0), -n, n)
+            si.sh_frame.n = n
         # Otherwise, rays leave on the side that they came from. They start on the surface or on the triangle, whichever
         # is in front, so that no triangle occludes them.
         t = dot(points.p - o, d) / dot(d, d)
-        is_before &= (t > 0) | (si.t == OUTLINE)
+        is_before &= (t > 0) | is_outline
         si.p, si.t = dr.select(is_before, variant.Point3f(points.p), si.p), dr.select(is_before, t, si.t)
         si.n = n
 

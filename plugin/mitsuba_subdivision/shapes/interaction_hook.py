@@ -154,11 +154,11 @@ class InteractionHook:
         self._tags: WeakKeyDictionary[Any, set[int]] = WeakKeyDictionary()
         triangle = _triangle(variant)
         entries = virtual_functions(table_of(triangle).value or 0)
-        index = _index_of(entries, "sample_silhouette", _OUTLINE_ARGUMENTS)
-        entries[index] = calling_after(entries[index], variant.SilhouetteSample3f, self._turn_outline)
         spectrum = variant.UnpolarizedSpectrum
         index = _index_of(entries, "compute_surface_interaction", _INTERACTION_ARGUMENTS)
         entries[index] = calling_after(entries[index], variant.SurfaceInteraction3f, self._complete)
+        index = _index_of(entries, "sample_silhouette", _OUTLINE_ARGUMENTS)
+        entries[index] = calling_after(entries[index], variant.SilhouetteSample3f, self._turn_outline)
         for suffix, result_type, sizes in (
             ("", spectrum, {1, dr.size_v(spectrum)}),
             ("_1", variant.Float, {1}),
@@ -175,9 +175,9 @@ class InteractionHook:
     def attach(
         self,
         shape: mi.Mesh,
-        # `ExactShading`, or another object with its methods `complete`, `attribute` and `turn_outline`; kept alive by the shape. Their
-        # errors propagate to the Python code that called Mitsuba. Their arguments are in memory of C++ and must not be
-        # kept.
+        # `ExactShading`, or another object with its methods `complete`, `attribute` and `turn_outline`; kept alive by
+        # the shape. Their errors propagate to the Python code that called Mitsuba. Their arguments are in memory of C++
+        # and must not be kept.
         answers: Any,
     ) -> None:
         """Override a shape's functions."""
@@ -315,7 +315,12 @@ def trial_problem(
     of_one, of_three = (_identity(name, si.t, active) for name in _ATTRIBUTES)
     for function, arguments, asked, value in (
         (shape.compute_surface_interaction, hit, _asked(hit), variant.Point2f(*_ANSWERED_UV)),
-        (shape.sample_silhouette, (variant.Point3f(*_ORIGIN), 0, active), _identity(active), variant.Point2f(*_ANSWERED_UV)),
+        (
+            shape.sample_silhouette,
+            (variant.Point3f(*_ORIGIN), 0, active),
+            _identity(active),
+            variant.Point2f(*_ANSWERED_UV),
+        ),
         (shape.eval_attribute, ("face_one", si, active), of_one, variant.UnpolarizedSpectrum(_VALUE[0])),
         (shape.eval_attribute_1, ("face_one", si, active), of_one, variant.Float(_VALUE[0])),
         (shape.eval_attribute_3, ("face_three", si, active), of_three, variant.Color3f(*_VALUE)),
