@@ -59,6 +59,28 @@ class Eigenbasis:
             matrix[block_slice, block_slice] = np.linalg.matrix_power(block, power)
         return matrix
 
+    def power_terms(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the first powers of T as sums of terms of rank one.
+
+        ``T**n`` is ``left @ diag(factors[n]) @ right``. The first K terms are those of the eigenvectors. What a block
+        adds to the powers of its eigenvalue has the rank of its Jordan blocks, which are few.
+
+        Returns left (K, t), right (t, K) and factors (count, t).
+        """
+        size, exponents = len(self.eigenvalues), np.arange(count)
+        left, right, factors = [np.eye(size)], [np.eye(size)], [self.eigenvalues ** exponents[:, None]]
+        for block_slice, block in self.blocks:
+            mean, identity = self.eigenvalues[block_slice.start], np.eye(len(block))
+            added = np.stack([np.linalg.matrix_power(block, n) - mean**n * identity for n in exponents.tolist()])
+            columns, sizes, _ = np.linalg.svd(np.hstack(added), full_matrices=False)
+            columns, rows = columns[:, sizes > DIAGONAL], np.linalg.svd(np.vstack(added), full_matrices=False)[2]
+            rank = columns.shape[1]
+            rows = rows[:rank]
+            left.append(np.repeat(np.eye(size)[:, block_slice] @ columns, rank, axis=1))
+            right.append(np.tile(rows @ np.eye(size)[block_slice], (rank, 1)))
+            factors.append((columns.T @ added @ rows.T).reshape(count, -1))
+        return np.hstack(left), np.vstack(right), np.hstack(factors)
+
     def turned_over(self) -> Eigenbasis:
         """Return the basis with its third eigenvector negated, which reverses the characteristic map's orientation."""
         sign = np.ones(len(self.eigenvalues))

@@ -155,7 +155,7 @@ def level_polynomials(patch: IrregularPatch, form: FloatArray, levels: NDArray[n
     """
     rows: FloatArray = form @ patch.eigen_children
     flat = np.repeat(rows.reshape(-1, 1, rows.shape[2]), len(levels), axis=1)
-    powers = times_powers(flat, levels, patch.basis, 1.0).reshape(*rows.shape[:2], len(levels), -1)
+    powers = times_powers(flat, levels, patch.basis, 1.0).reshape(*rows.shape[:2], len(levels), rows.shape[2])
     # The first eigenvector is one, whose coefficients are whole numbers.
     powers[..., 0] = np.rint(form.sum(axis=1))[:, None]
     return np.moveaxis(powers, 2, 0)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.shared import Content, Shared
-from ..patches.piece_table import NOTHING, PACKET, PieceTable, piece_packets
+from ..patches.piece_table import PACKET, PieceTable, piece_packets
 from .array_types import (
     NO_CONFLICTS,
     ArrayTypes,
@@ -30,7 +30,6 @@ from .array_types import (
     Mask,
     Value,
     Vector3,
-    Vector4,
 )
 
 if TYPE_CHECKING:
@@ -253,8 +252,8 @@ class CoefficientMap:
         self._refined_count = table.control_count if refinement is None else refinement.shape[0]
         # Parts of patches have control points of their own, stored after all others, and so are their indices.
         point_count, packets_of_piece = self._refined_count, table.packets_of_piece
-        parts, pieces, rings = [], [], []
-        for tree, (first, count, control_count, first_piece, piece_count, first_ring, is_ring) in zip(
+        parts, pieces = [], []
+        for tree, (first, count, control_count, first_piece, piece_count) in zip(
             table.trees, table.classes.tolist(), strict=True
         ):
             for begin, stencils, weights in tree.maps:
@@ -265,17 +264,9 @@ class CoefficientMap:
                     point_count += count * part_size
                 packet, step = packets_of_piece * (first_piece + begin), packets_of_piece * piece_count
                 pieces.append((weights, part_first, count, part_size, packet, packets_of_piece, step))
-            if is_ring:
-                ring = controls[first : first + count * control_count].reshape(control_count, count).T
-                origin = np.where(np.arange(control_count) == 0, NOTHING, ring[:, :1])
-                packets = first_ring + np.arange(ring.size).reshape(ring.shape)
-                rings.append(np.stack([ring, origin, packets]).reshape(3, -1))
         self._point_count = point_count
         all_controls = types.indices(controls, np.arange(self._refined_count, point_count))
         self._parts, self._pieces = (_packet_blocks(types, added, all_controls) for added in (parts, pieces))
-        # Control points stored among the coefficients: their indices; the indices of their origins, or `NOTHING`; and
-        # their packets.
-        self._rings = [types.indices(column) for column in np.concatenate(rings, axis=1)] if rings else None
 
     def __call__(
         self,
@@ -300,10 +291,6 @@ class CoefficientMap:
             dr.scatter(padded, dr.gather(types.vector4, refined, index), index, mode=NO_CONFLICTS)
             self._parts.write(refined, padded)
         coefficients: FloatBuffer = dr.zeros(types.float, PACKET * self._packet_count)
-        if self._rings is not None:
-            control, first, packet = self._rings
-            origin = dr.gather(types.vector4, padded, first, first != NOTHING)
-            dr.scatter(coefficients, dr.gather(types.vector4, padded, control) - origin, packet, mode=NO_CONFLICTS)
         if self._pieces is not None:
             self._pieces.write(padded, coefficients)
         return coefficients
@@ -312,11 +299,6 @@ class CoefficientMap:
         """Gradient by the control points, from the gradient by the coefficients."""
         types = self._types
         sums: FloatBuffer = dr.zeros(types.float, PACKET * self._point_count)
-        if self._rings is not None:
-            control, first, packet = self._rings
-            ring_gradient: Vector4 = dr.gather(types.vector4, gradient, packet)
-            dr.scatter_add(sums, ring_gradient, control)
-            dr.scatter_add(sums, -ring_gradient, first, first != NOTHING)
         if self._pieces is not None:
             self._pieces.write_transposed(gradient, sums)
         if self._parts is not None:

@@ -1,7 +1,7 @@
 """Evaluation of patches at any parameters: of points, or of other values that are subdivided like points.
 
 A sample is evaluated from the coefficients of the piece that contains it, which a `CoefficientMap` has computed. Close
-to an extraordinary point, at levels that have no pieces, equations (10) and (12) are summed over the one-ring instead.
+to an extraordinary point, at levels that have no pieces, the terms of equations (10) and (12) are summed instead.
 """
 
 from __future__ import annotations
@@ -14,14 +14,16 @@ from operator import add
 from typing import Any, NamedTuple
 
 import drjit as dr
+import numpy as np
 
 from ..evaluation.irregular_patch import LEVEL_PIECES, PIECE_LEVELS
 from ..evaluation.patch_tree import PartKind
 from ..evaluation.polynomials import polynomial_basis
 from ..patches.piece_table import (
     CODE,
-    CONTROL,
     CORNERS,
+    FACTORS,
+    FRAME,
     FRAMES,
     KINDS,
     LEVEL,
@@ -29,6 +31,8 @@ from ..patches.piece_table import (
     PACKET,
     PATCH,
     PATCH_CORNER,
+    REST,
+    TERM,
     TURN,
     WHOLE,
     FrameKind,
@@ -71,7 +75,7 @@ class PatchValues:
     def shifted(self, du: Float, dv: Float) -> PatchValues:
         """Attach the value and its first derivatives to parameters that move by ``du`` and ``dv``.
 
-        Requires second derivatives. Automatic differentiation cannot replace them: the loop over a tip's control points
+        Requires second derivatives. Automatic differentiation cannot replace them: the loop over a tip's terms
         is not differentiated by the parameters, and two such loops in forward mode raise an error in Dr.Jit 1.5.
         """
         uu, uv, vv = map(dr.detach, self.second)
@@ -98,15 +102,18 @@ class PatchValues:
         return PatchValues(self.value, like(du, self.value), like(dv, self.value), self.normal)
 
 
-class Tip(NamedTuple):
-    """Terms to sum at the levels of a tip that have no pieces, see `TreeArrays.weights`."""
+class TipTerms(NamedTuple):
+    """Terms to sum at the levels of a tip that have no pieces, see `patches.piece_table.Tip`."""
 
-    control_count: Index  # Size of the one-ring; 0 where the sample lies in a piece
-    ring: Index  # First packet of the control points
+    count: Index  # 0 where the sample lies in a piece
+    coordinates: Index  # First number of the coordinates
     row: Index  # First row of the block
+    factor: Index  # First factor
     # First row of the block whose derivatives are the tangents where those of the surface do not span the tangent
-    # plane; the lanes that need these tangents, and those that need `uneven_frame`. None if no tip has such lanes.
+    # plane, and its first factor; the lanes that need these tangents, and those that need `uneven_frame`. None if no
+    # tip has such lanes.
     frame_row: Index = None
+    frame_factor: Index = None
     needs_frame: Mask = None
     is_uneven: Mask = None
 
@@ -124,13 +131,13 @@ class Piece:
     t: Float
     jacobian: tuple[Float, Float, Float, Float]  # ds/du, ds/dv, dt/du, dt/dv for the given parameters u, v
     magnification: Float  # Absolute scale of s and t relative to u and v: a power of two
-    tip: Tip | None
+    tip: TipTerms | None
     size: int  # Number of components of a value
 
     @property
     def is_deep(self) -> Mask | None:
         """Whether parameters lie at a level of a tip that has no pieces; None if there are no tips."""
-        return None if self.tip is None else self.tip.control_count > 0
+        return None if self.tip is None else self.tip.count > 0
 
     def is_inside(self, du: Float, dv: Float, tolerance: Float) -> Mask:
         """Whether parameters offset by ``du`` and ``dv`` lie in the piece, or within a tolerance of it."""
@@ -173,40 +180,49 @@ class Piece:
         return self.s + (a * du + b * dv), self.t + (c * du + d * dv)
 
     def _with_tip(
-        self, tip: Tip, value: list, partials: list[list], s: Float, t: Float, derivatives: int
+        self, tip: TipTerms, value: list, partials: list[list], s: Float, t: Float, derivatives: int
     ) -> tuple[list, list[list], tuple[list, list] | None]:
-        """Add the sums over a tip's one-ring to the value and the derivatives.
+        """Add the sums of a tip's terms to the value and the derivatives.
 
         Returns both, and tangents by s and t that span the tangent plane if derivatives do not everywhere.
         """
         kernel, types, size = self.kernel, self.kernel.types, self.size
         evaluate, has_frame = kernel.monomials.values, tip.frame_row is not None
 
-        def control(index: Index, active: Mask = True) -> list[Float]:
-            return [*dr.gather(types.vector4, self.buffer, tip.ring + index, active)][:size]
+        # A piece has a coordinate in place of each of its coefficients, and begins with the first coordinate.
+        width = kernel.count - 1
 
-        def add_control(k, *totals):
-            weights = evaluate(kernel.weights(tip.row + k), s, t, derivatives)
+        def coordinate(number: Index, active: Mask = True) -> list[Float]:
+            """Coordinate of the term after a number of others that are not the first."""
+            offset = tip.coordinates + number // width * kernel.numbers + number % width * 3
+            return [dr.gather(types.float, self.buffer, offset + i, active) for i in range(3, 3 + size)]
+
+        def add_term(k, *totals):
+            factor = kernel.factor(tip.factor + k)
+            weights = [weight * factor for weight in evaluate(kernel.weights(tip.row + k), s, t, derivatives)]
             if has_frame:
-                weights += evaluate(kernel.weights(tip.frame_row + k, tip.needs_frame), s, t)[1:]
-            products = itertools.product(weights, control(k))
+                factor = kernel.factor(tip.frame_factor + k, tip.needs_frame)
+                tangents = evaluate(kernel.weights(tip.frame_row + k, tip.needs_frame), s, t)[1:]
+                weights += [tangent * factor for tangent in tangents]
+            products = itertools.product(weights, coordinate(k - 1))
             return k + 1, *(dr.fma(x, weight, total) for (weight, x), total in zip(products, totals, strict=True))
 
         sum_count = size * (1 + len(partials) + 2 * has_frame)
         # The loop only computes sums: ``max_iterations=-1`` lets reverse mode run without storing its iterations.
         keywords: dict[str, Any] = {"max_iterations": -1} if dr.grad_enabled(self.buffer) else {}
         _, *totals = dr.while_loop(
-            # Start with the second control point, as the others are relative to the first.
+            # The first term is the extraordinary point itself.
             (types.index(1), *(types.float(0) for _ in range(sum_count))),
-            lambda k, *_: k < tip.control_count,
-            add_control,
+            lambda k, *_: k < tip.count,
+            add_term,
             mode="symbolic",
             label="tip",
             **keywords,
         )
         value_sum, *derivative_sums = (totals[i : i + size] for i in range(0, sum_count, size))
-        is_deep = tip.control_count > 0
-        point = added(control(types.index(0), is_deep), value_sum)
+        is_deep = tip.count > 0
+        first = [dr.gather(types.float, self.buffer, tip.coordinates + i, is_deep) for i in range(size)]
+        point = added(first, value_sum)
         value, *partials = (
             added(vector, change) for vector, change in zip((value, *partials), (point, *derivative_sums), strict=False)
         )
@@ -218,7 +234,7 @@ class Piece:
         if not has_frame:
             return value, partials, None
         by_s, by_t, tangent_s, tangent_t = *partials[:2], *derivative_sums[-2:]
-        _, slow_s, slow_t = evaluate(kernel.weights(tip.row, tip.is_uneven), s, t)
+        _, slow_s, slow_t = evaluate(kernel.weights(tip.row + 1, tip.is_uneven), s, t)
         uneven = combined(by_s, slow_s, by_t, slow_t), combined(tangent_t, slow_s, tangent_s, -slow_t)
         frame_s, frame_t = (
             selected(tip.needs_frame, selected(tip.is_uneven, *frame), derivative)
@@ -247,8 +263,8 @@ class PieceKernel:
         # Coefficients of each function of the scheme's basis, for Stam's form
         self.basis_functions = basis.matrix.T.tolist() if use_stam else None
         self.walk = ElementWalk(table, types)  # Over the table's elements
-        self._count = len(basis.powers)
-        self._numbers, self._row_size = PACKET * table.packets_of_piece, -(-self._count // PACKET) * PACKET
+        self.count = len(basis.powers)
+        self.numbers, self._row_size = PACKET * table.packets_of_piece, -(-self.count // PACKET) * PACKET
         self._piece_levels = table.piece_levels
         self._patch_starts, self._nodes = types.indices(table.patch_starts), types.indices(table.nodes)
         kinds = table.nodes[:, 0] & KINDS
@@ -256,8 +272,7 @@ class PieceKernel:
         self._has_tips = bool((kinds == _TIP).any())
         self._has_frames = bool((table.nodes[:, 3] & FRAMES).any())
         if self._has_tips:
-            self._weights = types.floats(table.weights(self._row_size, types.numpy_float))
-            self._rings = types.indices(table.rings)
+            self._weights = types.floats(np.concatenate([tip.rows for tip in table.tips], dtype=types.numpy_float))
         self._is_split = table.refinement is not None
 
     def piece(
@@ -292,31 +307,31 @@ class PieceKernel:
         number, is_piece, tip = first_piece + number, active, None
         if self._has_tips:
             is_tip = (kind & KINDS) == _TIP
-            level_count = tip_code // LEVEL & LEVELS
+            level_count, term_count = tip_code // LEVEL & LEVELS, tip_code // TERM
             level, child, u, v, scale = self._at_level(is_tip, level_count, u, v, scale)
+            coordinates = (number + LEVEL_PIECES * self._piece_levels) * self.numbers
             number += child
             is_deep = active & is_tip & (level >= self._piece_levels)
             is_piece = active & ~is_deep
-            block, is_rest = child - LEVEL_PIECES * self._piece_levels, level == level_count
-            control_count = tip_code // CONTROL
-            ring = dr.gather(types.index, self._rings, patch, is_deep)
+            is_rest = level == level_count
+            block = dr.select(is_rest, REST, child - LEVEL_PIECES * level)
+            row = dr.fma(block, term_count, block_row)
+            factor = dr.fma(term_count, FACTORS, block_row) * self._row_size + level * term_count
             frames: tuple = ()
-            if self._has_frames:
+            if self._has_frames and size == 3:
                 frame = tip_code & FRAMES
                 is_uneven = is_deep & (frame == _UNEVEN) & (level >= PIECE_LEVELS) & ~is_rest
                 needs_frame = is_uneven | (is_deep & is_rest & (frame != 0))
-                # Blocks of the levels and of the rest, the frame at the point, then the frames of uneven levels.
-                first_frame = LEVEL_PIECES * (level_count - self._piece_levels) + 1
-                frame_block = first_frame + dr.select(is_uneven, block + 1, types.index(0))
-                frames = dr.fma(frame_block, control_count, block_row), needs_frame, is_uneven
-            summed_count = dr.select(is_deep, control_count, types.index(0))
-            tip = Tip(summed_count, ring, dr.fma(block, control_count, block_row), *frames)
-        numbers = types.row(buffer, self._numbers, number, is_piece)
+                frame_row = dr.select(is_uneven, row, dr.fma(term_count, FRAME, block_row))
+                frame_factor = factor + dr.select(is_uneven, (level_count + 1) * term_count, 0)
+                frames = frame_row, frame_factor, needs_frame, is_uneven
+            tip = TipTerms(dr.select(is_deep, term_count, 0), coordinates, row, factor, *frames)
+        numbers = types.row(buffer, self.numbers, number, is_piece)
         a, b, c, d = turn_matrix(domain, types, (turn + quarter) % domain.corner_count)
         return Piece(
             self,
             buffer,
-            [numbers[i : 3 * self._count : 3] for i in range(size)],
+            [numbers[i : 3 * self.count : 3] for i in range(size)],
             u - self.centre[0],
             v - self.centre[1],
             (a * scale, b * scale, c * scale, d * scale),
@@ -327,7 +342,11 @@ class PieceKernel:
 
     def weights(self, row: Index, active: Mask = True) -> list:
         """Fetch a row of the blocks, with one weight for each monomial."""
-        return self.types.row(self._weights, self._row_size, row, active)[: self._count]
+        return self.types.row(self._weights, self._row_size, row, active)[: self.count]
+
+    def factor(self, index: Index, active: Mask = True) -> Float:
+        """Fetch the factor of a term."""
+        return dr.gather(self.types.float, self._weights, index, active)
 
     def first_term(self, s: Float, t: Float) -> list[Float]:
         """Rounding errors of the first terms of (9) and (11), which (10) and (12) avoid.

@@ -7,9 +7,9 @@ A regular piece is a polynomial, whose coefficients are weights times the contro
 is each of the three regular children at the first levels of a tip. These coefficients are computed once for the control
 points, and suffice for nearly all samples: after three levels a 64th of a tip's domain is left.
 
-Deeper levels use equations (10) and (12) as a table. A *block* has a row for each control point of the one-ring, and a
-column for each monomial of the scheme's `PolynomialBasis`. The sum of rows times control points, relative to the first
-control point, gives coefficients. The first eigenvector, which is constant, contributes only to the point itself.
+Deeper levels are sums by equations (10) and (12). Their terms are polynomials that all levels and all tips of a kind
+share, times a factor for each level, times eigen-coordinates of the tip, which are computed as its pieces are. The
+first eigenvector, which is constant, contributes only to the point itself.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from ..evaluation.irregular_patch import LEVEL_PIECES, PIECE_LEVELS, IrregularPatch, float32_levels, level_polynomials
 from ..evaluation.patch_tree import PartKind, PatchTree, patch_trees
@@ -46,9 +46,12 @@ TWIN, FOLLOWING, PRECEDING, CODE = range(4)
 # a whole element, and of the index of the patch.
 CORNERS, PATCH_CORNER, WHOLE, PATCH = 3, 4, 16, 32
 # Bit fields of the first column of `PieceTable.nodes`: mask of the kind, unit of the turn. Of the last column: mask of
-# the frame, unit and mask of the number of levels, unit of the number of controls.
+# the frame, unit and mask of the number of levels, unit of the number of terms.
 KINDS, TURN = 3, 4
-FRAMES, LEVEL, LEVELS, CONTROL = 3, 4, 1023, 4096
+FRAMES, LEVEL, LEVELS, TERM = 3, 4, 1023, 4096
+# Blocks of `Tip.rows` after those of the regular children of a level: the rest, and the frame at the point; then come
+# the factors.
+REST, FRAME, FACTORS = LEVEL_PIECES, LEVEL_PIECES + 1, LEVEL_PIECES + 2
 # Most bytes of coefficients, in single precision, of the levels of tips that are stored as pieces.
 COEFFICIENT_BYTES = 1 << 26
 # Maximum number of pieces of a part whose coefficients are stored as a whole. Larger elements are split into parts:
@@ -75,22 +78,32 @@ class PieceMap(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class TreeArrays:
-    """Nodes, pieces and blocks of a patch tree, with indices that begin at 0."""
+class Tip:
+    """Levels of tips of one kind that have no pieces, as sums of terms: polynomials times factors times coordinates."""
+
+    # (r, n) float64: a row for each term, with a coefficient for each monomial, padded to whole packets, in blocks: one
+    # for each regular child of level 0; one for the rest, linear with the tangents along the edges; one whose
+    # derivatives are the frame of (13). Then, one after another, the factors of all terms for each level, and ones for
+    # the rest. If the frame is uneven, the same factors without the second eigenvector, divided by the power of the
+    # third eigenvalue, follow.
+    rows: FloatArray
+    coordinates: FloatArray  # (t, K) float64: coordinates of the terms over the eigen-coordinates
+    frame: FrameKind
+    level_count: int
+
+
+class TreeArrays(NamedTuple):
+    """Nodes, pieces and tips of a patch tree, with indices that begin at 0."""
 
     # (n, 4) int64; the first node is the element. `PartKind` plus `TURN` times `PatchTree.turn`; index of the first of
-    # consecutive children, or for a leaf of its first piece, as the pieces of a tip are consecutive, level by level;
-    # row of `weights` at which a tip's blocks begin; `FrameKind` of a tip plus `LEVEL` times the number of its levels,
-    # after which its rest begins, plus `CONTROL` times the number of control points in the one-ring
+    # consecutive children, or for a leaf of its first piece; index of a tip in `tips`; `FrameKind` of a tip plus
+    # `LEVEL` times the number of its levels, after which its rest begins, plus `TERM` times the number of its terms.
+    # Pieces of a tip are consecutive, level by level; the coordinates of its terms are stored after them as pieces,
+    # each of which begins with the first coordinate, the extraordinary point.
     nodes: IntArray
     piece_count: int
     maps: tuple[PieceMap, ...]  # Maps to the coefficients of all pieces
-    # (b K, m) float64: blocks of tips. For each tip: one for each regular child of each deeper level; one for the rest,
-    # linear with the tangents along the edges; one whose derivatives are the frame of (13). If the frame is uneven,
-    # another one for each regular child of each deeper level: the point without the second eigenvector, divided by the
-    # power of the third eigenvalue. Row 0 of a block has no weights, as the first control point, relative to itself, is
-    # zero. In uneven tips row 0 is the polynomial of the second eigenvector, for `uneven_frame`.
-    weights: FloatArray
+    tips: tuple[Tip, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +113,7 @@ class PieceTable:
     An element is identified by one of its half-edges, at which parameters start, as in `PatchSampler.evaluate`.
 
     *Coefficients* depend on the control points. They are the polynomials of the pieces of all patches, three numbers
-    for each monomial, padded to whole packets; then, for each patch with tips, the control points of its one-ring, each
-    padded to a packet, all but the first one relative to the first one. The whole is padded to whole pieces.
+    for each monomial, padded to whole packets.
     """
 
     patches: PatchTable
@@ -110,12 +122,12 @@ class PieceTable:
     packets_of_piece: int  # Packets of the coefficients of a piece
     packet_count: int  # Packets of all coefficients
     patch_starts: NDArray[np.uint32]  # (p, 2) uint32: first piece and first node of each patch
-    # (p,) uint32: first packet of the control points of each patch; any number for patches without tips
-    rings: NDArray[np.uint32]
-    nodes: NDArray[np.uint32]  # (n, 4) uint32: `TreeArrays.nodes` of all classes, counted through all of them
-    trees: tuple[TreeArrays, ...]  # Of each class
-    # (c, 7) uint32, for each class: index of its first entry in `controls`; number of patches, and of controls per
-    # patch; first piece; number of pieces per patch; first packet of control points; number of these per patch
+    # (n, 4) uint32: `TreeArrays.nodes` of all classes, counted through all of them; for tips the first row of `weights`
+    nodes: NDArray[np.uint32]
+    elements: tuple[PatchTree, ...]  # Of each class
+    tips: tuple[Tip, ...]  # Different ones of all classes
+    # (c, 5) uint32, for each class: index of its first entry in `controls`; number of patches, and of controls per
+    # patch; first piece; number of pieces per patch
     classes: NDArray[np.uint32]
     # (n,) uint32: `PatchTable.controls` as indices of control values, or of refined ones if there is a `refinement`
     controls: NDArray[np.uint32]
@@ -149,19 +161,20 @@ class PieceTable:
         bytes_of_level = 4 * PACKET * packets_of_piece * LEVEL_PIECES * tip_count
         if bytes_of_level:
             piece_levels = min(piece_levels, COEFFICIENT_BYTES // bytes_of_level)
-        trees = tuple(tree_arrays(element, piece_levels) for element in counted(elements, "Pieces of patch classes"))
+        trees = [tree_arrays(element, piece_levels) for element in counted(elements, "Pieces of patch classes")]
         sizes = np.array([tree.piece_count for tree in trees])
-        rings = np.where([len(tree.weights) > 0 for tree in trees], control_counts, 0)
         first_pieces, piece_count = ragged.starts(sizes * counts), int(sizes @ counts)
-        first_rings = packets_of_piece * piece_count + ragged.starts(rings * counts)
-        packet_count = packets_of_piece * piece_count + int(rings @ counts)
-        first_controls = [kind.first_control for kind in table.classes]
-        columns = first_controls, counts, control_counts, first_pieces, sizes, first_rings, rings
-        node_counts, weight_counts = np.array([(len(tree.nodes), len(tree.weights)) for tree in trees]).T
+        columns = [kind.first_control for kind in table.classes], counts, control_counts, first_pieces, sizes
+        node_counts = np.array([len(tree.nodes) for tree in trees])
         first_nodes, nodes = ragged.starts(node_counts), np.concatenate([tree.nodes for tree in trees])
+        every_tip = [tip for tree in trees for tip in tree.tips]
+        tips = tuple(dict.fromkeys(every_tip))
+        first_row = dict(zip(tips, ragged.starts(np.array([len(tip.rows) for tip in tips])).tolist(), strict=True))
+        nodes[:, 2] += np.repeat(ragged.starts(np.array([len(tree.tips) for tree in trees])), node_counts)
+        is_tip = nodes[:, 0] & KINDS == PartKind.TIP
+        nodes[is_tip, 2] = np.array([first_row[tip] for tip in every_tip], dtype=np.int64)[nodes[is_tip, 2]]
         is_inner = nodes[:, 0] & KINDS <= PartKind.ONLY_CHILD
         nodes[:, 1] += is_inner * np.repeat(first_nodes, node_counts)
-        nodes[:, 2] += np.repeat(ragged.starts(weight_counts), node_counts)
         in_class = ragged.index_in_row(counts)
         starts = np.repeat(first_pieces, counts) + np.repeat(sizes, counts) * in_class, np.repeat(first_nodes, counts)
         return cls(
@@ -169,22 +182,19 @@ class PieceTable:
             control_count,
             piece_levels,
             packets_of_piece,
-            packet_count + -packet_count % packets_of_piece,
+            packets_of_piece * piece_count,
             np.stack(starts, axis=1).astype(np.uint32),
-            (np.repeat(first_rings, counts) + np.repeat(rings, counts) * in_class).astype(np.uint32),
             nodes.astype(np.uint32),
-            trees,
+            tuple(elements),
+            tips,
             np.stack(columns, axis=1).astype(np.uint32),
             *patches.control_rows(control_of_vertex, control_count),
         )
 
-    def weights(self, size: int, dtype: DTypeLike = np.float64) -> FloatArray:
-        """``(w, size)`` `TreeArrays.weights` of all classes, padded with zeros.
-
-        Computed at each call, as kernels keep the result.
-        """
-        rows = np.concatenate([tree.weights for tree in self.trees], dtype=dtype)
-        return np.pad(rows, ((0, 0), (0, size - rows.shape[1])))
+    @property
+    def trees(self) -> list[TreeArrays]:
+        """Arrays of each class, which are large: kernels upload them, and nothing else keeps them."""
+        return [tree_arrays(element, self.piece_levels) for element in self.elements]
 
     @property
     def half_edges(self) -> NDArray[np.uint32]:
@@ -225,65 +235,71 @@ def piece_packets(monomial_count: int) -> int:
 @lru_cache(maxsize=128)
 def tree_arrays(
     element: PatchTree,
-    piece_levels: int = PIECE_LEVELS,  # Number of levels of a tip that are pieces; the others are blocks
+    piece_levels: int = PIECE_LEVELS,  # Number of levels of a tip that are pieces; the others are summed
 ) -> TreeArrays:
     """Return the arrays of a patch tree."""
     scheme = element.scheme
     kinds, turns, first = element.nodes.T.copy()
+    index, end = np.zeros((2, len(first)), dtype=np.int64)
     # Regular pieces come before those of tips.
     maps, piece_count = [], 0
     for part, stencils in _shared_parts(element):
         pieces = _regular_pieces(scheme, part)
         maps.append(PieceMap(piece_count, stencils, pieces))
         piece_count += len(pieces)
-    row, end = np.zeros(len(first), dtype=np.int64), np.full(len(first), CONTROL * element.control_count)
-    weights: list[FloatArray] = [np.empty((0, len(polynomial_basis(scheme).powers)))]
-    row_count = 0
     # In nodes of tips, `first` is the index in `PatchTree.tips`.
-    tip_nodes = np.flatnonzero(kinds == PartKind.TIP)
+    tip_nodes, tips = np.flatnonzero(kinds == PartKind.TIP), []
     for node, piece in zip(tip_nodes[np.argsort(first[tip_nodes])].tolist(), element.tips, strict=True):
-        tip_pieces, tip_blocks, first_rows, frame, level_count = _tip(scheme, piece.irregular_patch, piece_levels)
-        first[node], row[node] = piece_count, row_count
-        end[node] += frame + LEVEL * level_count
-        maps.append(PieceMap(piece_count, None, tip_pieces @ piece.coordinates))
-        blocks = (tip_blocks @ piece.coordinates).swapaxes(1, 2).copy()
-        blocks[: len(first_rows), 0] = first_rows
-        weights.append(blocks.reshape(-1, blocks.shape[2]))
-        piece_count, row_count = piece_count + len(tip_pieces), row_count + len(weights[-1])
-    nodes = np.stack([kinds + TURN * turns, first, row, end], axis=1)
+        tip, of_levels = _tip(scheme, piece.irregular_patch), _tip_pieces(scheme, piece.irregular_patch, piece_levels)
+        first[node], index[node] = piece_count, len(tips)
+        end[node] = tip.frame + LEVEL * tip.level_count + TERM * len(tip.coordinates)
+        coordinates = tip.coordinates[1:] @ piece.coordinates
+        # Each piece begins with the first coordinate, as the weights of a piece's constant sum to one.
+        width = of_levels.shape[1] - 1
+        stored = np.pad(coordinates, ((0, -len(coordinates) % width), (0, 0))).reshape(-1, width, coordinates.shape[1])
+        points = np.broadcast_to(piece.coordinates[0], (len(stored), 1, coordinates.shape[1]))
+        pieces = np.concatenate([of_levels @ piece.coordinates, np.concatenate([points, stored], axis=1)])
+        maps.append(PieceMap(piece_count, None, pieces))
+        tips.append(tip)
+        piece_count += len(pieces)
+    nodes = np.stack([kinds + TURN * turns, first, index, end], axis=1)
     maps = [piece_map for piece_map in maps if len(piece_map.pieces)]
-    return TreeArrays(nodes, piece_count, tuple(maps), np.concatenate(weights))
+    return TreeArrays(nodes, piece_count, tuple(maps), tuple(tips))
 
 
-# A tip takes some megabytes at high valences.
-@lru_cache(maxsize=16)
-def _tip(
-    scheme: Scheme, patch: IrregularPatch, piece_levels: int
-) -> tuple[FloatArray, FloatArray, FloatArray, FrameKind, int]:
-    """Return polynomials of a tip over the eigen-coordinates.
-
-    Returns those of the pieces ``(n, m, K)``; the blocks ``(b, m, K)``; row 0 of the first l blocks ``(l, m)``, see
-    `TreeArrays.weights`; the kind of frame; and the number of levels.
-    """
+@lru_cache(maxsize=1024)
+def _tip(scheme: Scheme, patch: IrregularPatch) -> Tip:
+    """Return the terms of a tip."""
     basis, polynomials, level_count = patch.basis, polynomial_basis(scheme), float32_levels(patch)
-    by_level = level_polynomials(patch, polynomials.matrix, np.arange(level_count))
-    shape = -1, *by_level.shape[2:]
-    deeper = by_level[piece_levels:]
-    rest: FloatArray = np.zeros((2, *shape[1:]))
+    left, coordinates, factors = basis.power_terms(level_count)
+    term_count = len(coordinates)
+    blocks: FloatArray = np.zeros((FACTORS, term_count, len(polynomials.powers)))
+    blocks[:REST] = (polynomials.matrix @ patch.eigen_children @ left).swapaxes(1, 2)
     u, v = (int(np.flatnonzero((polynomials.powers == power).all(axis=1))[0]) for power in ((1, 0), (0, 1)))
-    rest[0, [u, v]], rest[1, [u, v]] = basis.subdominant**level_count * patch.edge_tangents, patch.limit_frame
+    # The first terms are those of the eigen-coordinates.
+    rest, frame = blocks[REST:, : len(basis.eigenvalues)]
+    rest[:, [u, v]] = basis.subdominant**level_count * patch.edge_tangents.T
+    frame[:, [u, v]] = patch.limit_frame.T
     # Polynomials are about the middle of the domain, and the extraordinary point is at its corner.
-    rest[0, 0] = scheme.domain.centre @ rest[0, [u, v]]
-    rest[0, 0, 0] = 1
-    blocks, second_eigenvector = [deeper.reshape(shape), rest], 0 * by_level[0, :, :, 0]
-    frame = FrameKind.AT_POINT if patch.has_own_frame else FrameKind.DERIVATIVES
+    rest[:, 0] = rest[:, [u, v]] @ scheme.domain.centre
+    rest_factors, tables = np.ones((1, term_count)), [factors]
     if patch.contracts_unevenly:
-        across = deeper / basis.moduli[2] ** np.arange(piece_levels, level_count)[:, None, None, None]
-        across[..., :2] = 0
-        blocks.append(across.reshape(shape))
-        frame, second_eigenvector = FrameKind.UNEVEN, by_level[0, :, :, 1]
-    second_eigenvector = np.tile(second_eigenvector, (len(deeper), 1))
-    return by_level[:piece_levels].reshape(shape), np.concatenate(blocks), second_eigenvector, frame, level_count
+        across = factors / basis.moduli[2] ** np.arange(level_count)[:, None]
+        across[:, :2] = 0
+        tables.append(across)
+    values = np.concatenate([part.ravel() for table in tables for part in (table, rest_factors)])
+    size = -(-len(polynomials.powers) // PACKET) * PACKET
+    rows = np.pad(blocks.reshape(-1, blocks.shape[2]), ((0, 0), (0, size - blocks.shape[2])))
+    rows = np.concatenate([rows, np.pad(values, (0, -len(values) % size)).reshape(-1, size)])
+    kind = FrameKind.AT_POINT if patch.has_own_frame else FrameKind.DERIVATIVES
+    return Tip(rows, coordinates, FrameKind.UNEVEN if patch.contracts_unevenly else kind, level_count)
+
+
+@lru_cache(maxsize=1024)
+def _tip_pieces(scheme: Scheme, patch: IrregularPatch, piece_levels: int) -> FloatArray:
+    """Return the polynomials of the first levels of a tip over the eigen-coordinates, ``(n, m, K)``."""
+    by_level = level_polynomials(patch, polynomial_basis(scheme).matrix, np.arange(piece_levels))
+    return by_level.reshape(by_level.shape[0] * by_level.shape[1], *by_level.shape[2:])
 
 
 def _shared_parts(element: PatchTree) -> list[tuple[PatchTree, FloatArray | None]]:
