@@ -7,7 +7,7 @@ from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.evaluation.irregular_patch import PIECE_LEVELS
 from mitsuba_subdivision.evaluation.patch_tree import patch_trees
 from mitsuba_subdivision.patches import piece_table as layout
-from mitsuba_subdivision.patches.piece_table import PieceTable
+from mitsuba_subdivision.patches.piece_table import PACKET, PieceTable, piece_packets
 from patches.closed_cages import bumpy, mixed_torus
 from reference.refined_cages import refine_first, sheet, tagged
 
@@ -25,15 +25,15 @@ def test_tips_keep_fewer_levels_as_pieces_where_these_would_take_too_much_memory
         # Made anew each time, as nothing keeps it.
         cage = surface.cage
         table = PieceTable.build(surface.patches, cage.cut_mesh.vertex, cage.vertex_count, levels)
-        return table.piece_levels, table.packet_count
+        return table.piece_levels, PACKET * piece_packets(16) * table.piece_count
 
     every = [made(levels) for levels in range(4)]
     assert [levels for levels, _ in every] == [0, 1, 2, 3]
     _, without = every[0]
-    for levels, packets in every:
-        monkeypatch.setattr(layout, "COEFFICIENT_BYTES", 16 * (packets - without))
-        assert made() == (levels, packets)
-        monkeypatch.setattr(layout, "COEFFICIENT_BYTES", 16 * (packets - without) - 1)
+    for levels, numbers in every:
+        monkeypatch.setattr(layout, "COEFFICIENT_BYTES", 4 * (numbers - without))
+        assert made() == (levels, numbers)
+        monkeypatch.setattr(layout, "COEFFICIENT_BYTES", 4 * (numbers - without) - 1)
         assert levels == 0 or made() == every[levels - 1]
 
 

@@ -17,6 +17,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from ..evaluation.polynomials import polynomial_basis
 from ..mesh import ragged
 from ..mesh.shared import Content, Shared
 from ..patches.piece_table import PACKET, PieceTable, piece_packets
@@ -155,11 +156,11 @@ class WeightBlocks:
         # weights.
         block: np.ndarray,
         patch: np.ndarray,
-        # (l,) int: first packet that each lane writes
-        packet: np.ndarray | None = None,
+        # (l,) int: which piece each lane writes, in an array of pieces of this many vectors
+        piece: np.ndarray | None = None,
     ) -> None:
         self._types, self._controls = types, controls
-        self._packet: IndexBuffer = None if packet is None else types.indices(packet)
+        self._piece: IndexBuffer = None if piece is None else types.indices(piece)
         self.width, self.count = weights[0].shape[1], len(block)
         self._row_size = -(-self.width // PACKET) * PACKET
         rows = np.zeros((sum(len(part) * part.shape[2] for part in weights), self._row_size), types.numpy_float)
@@ -209,19 +210,20 @@ class WeightBlocks:
         start: tuple[Index] = (dr.zeros(types.index, self.count),)
         dr.while_loop(start, lambda k: k < control_count, add, label="transposed_coefficients")
 
-    def write(self, padded: FloatBuffer, results: FloatBuffer) -> None:
-        """Compute all vectors from the padded control points, and scatter them as packets."""
-        numbers = [number for vector in self.vectors(padded)[0] for number in vector]
+    def write(self, padded: FloatBuffer, results: FloatBuffer, size: int = 3) -> None:
+        """Compute all vectors from the padded control points, and scatter ``size`` components of each as pieces."""
+        numbers = [number for vector in self.vectors(padded)[0] for number in [*vector][:size]]
         numbers += [self._types.float(0)] * (-len(numbers) % PACKET)
         for i in range(0, len(numbers), PACKET):
             packet = self._types.vector4(*numbers[i : i + PACKET])
-            dr.scatter(results, packet, self._packet + i // PACKET, mode=NO_CONFLICTS)
+            index = self._piece * (len(numbers) // PACKET) + i // PACKET
+            dr.scatter(results, packet, index, mode=NO_CONFLICTS)
 
-    def write_transposed(self, gradient: FloatBuffer, sums: FloatBuffer) -> None:
-        """Scatter-add the gradients by all packets, times the weights, to the control points' packets."""
-        packet_count = piece_packets(self.width)
-        numbers = self._types.row(gradient, PACKET * packet_count, self._packet // packet_count)
-        self.add_transposed([self._types.vector3(*numbers[3 * m : 3 * m + 3]) for m in range(self.width)], sums)
+    def write_transposed(self, gradient: FloatBuffer, sums: FloatBuffer, size: int = 3) -> None:
+        """Scatter-add the gradients by all pieces, times the weights, to the control points' packets."""
+        numbers = self._types.row(gradient, PACKET * piece_packets(self.width, size), self._piece)
+        vectors = (numbers[size * m : size * (m + 1)] + [0] * (3 - size) for m in range(self.width))
+        self.add_transposed([self._types.vector3(*vector) for vector in vectors], sums)
 
     def _lanes(self) -> tuple[Callable[[Index], Index], Index, Index]:
         """A function that returns the k-th control point of each lane; their number; the first row of weights."""
@@ -246,12 +248,13 @@ class CoefficientMap:
 
     def __init__(self, table: PieceTable, float_type: type) -> None:
         self._types = types = ArrayTypes(float_type)
-        self._packet_count, refinement, controls = table.packet_count, table.refinement, table.controls
+        refinement, controls = table.refinement, table.controls
+        self._piece_count, self._width = table.piece_count, len(polynomial_basis(table.patches.scheme).powers)
         # To the control points of the patches, if these are those of the cage refined once
         self._refinement = None if refinement is None else SparseMatrix.shared(refinement, float_type)
         self._refined_count = table.control_count if refinement is None else refinement.shape[0]
         # Parts of patches have control points of their own, stored after all others, and so are their indices.
-        point_count, packets_of_piece = self._refined_count, table.packets_of_piece
+        point_count = self._refined_count
         parts, pieces = [], []
         for tree, (first, count, control_count, first_piece, piece_count) in zip(
             table.trees, table.classes.tolist(), strict=True
@@ -262,16 +265,15 @@ class CoefficientMap:
                     part_first, part_size = len(controls) + point_count - self._refined_count, len(stencils)
                     parts.append((stencils[:, None], first, count, control_count, point_count, count, 1))
                     point_count += count * part_size
-                packet, step = packets_of_piece * (first_piece + begin), packets_of_piece * piece_count
-                pieces.append((weights, part_first, count, part_size, packet, packets_of_piece, step))
+                pieces.append((weights, part_first, count, part_size, first_piece + begin, 1, piece_count))
         self._point_count = point_count
         all_controls = types.indices(controls, np.arange(self._refined_count, point_count))
-        self._parts, self._pieces = (_packet_blocks(types, added, all_controls) for added in (parts, pieces))
+        self._parts, self._pieces = (_piece_blocks(types, added, all_controls) for added in (parts, pieces))
 
     def __call__(
         self,
         values: FloatBuffer,  # Control values of ``size`` components, flat
-        size: int = 3,  # At most 3; coefficients are padded to vectors of three components with zeros
+        size: int = 3,  # At most 3
         known: FloatBuffer | None = None,  # Known coefficients, which are then only attached to the values
     ) -> FloatBuffer:
         """Compute the coefficients, see `PieceTable`."""
@@ -279,10 +281,11 @@ class CoefficientMap:
         if size < 3:
             components = [values] if size == 1 else [*dr.unravel(types.vector(size), values)]
             points = dr.ravel(types.vector3(*components, *[0] * (3 - size)))
-        coefficients = self._applied(dr.detach(points)) if known is None else known
-        return attached(coefficients, points, self._applied, self._transposed)
+        coefficients = self._applied(size, dr.detach(points)) if known is None else known
+        return attached(coefficients, points, partial(self._applied, size), partial(self._transposed, size))
 
-    def _applied(self, points: FloatBuffer) -> FloatBuffer:
+    def _applied(self, size: int, points: FloatBuffer) -> FloatBuffer:
+        """Coefficients of ``size`` components, from control points of three."""
         types = self._types
         padded = types.padded(points if self._refinement is None else self._refinement.product(points))
         if self._parts is not None:
@@ -290,17 +293,18 @@ class CoefficientMap:
             index: Index = dr.arange(types.index, self._refined_count)
             dr.scatter(padded, dr.gather(types.vector4, refined, index), index, mode=NO_CONFLICTS)
             self._parts.write(refined, padded)
-        coefficients: FloatBuffer = dr.zeros(types.float, PACKET * self._packet_count)
+        packet_count = self._piece_count * piece_packets(self._width, size)
+        coefficients: FloatBuffer = dr.zeros(types.float, PACKET * packet_count)
         if self._pieces is not None:
-            self._pieces.write(padded, coefficients)
+            self._pieces.write(padded, coefficients, size)
         return coefficients
 
-    def _transposed(self, gradient: FloatBuffer) -> FloatBuffer:
+    def _transposed(self, size: int, gradient: FloatBuffer) -> FloatBuffer:
         """Gradient by the control points, from the gradient by the coefficients."""
         types = self._types
         sums: FloatBuffer = dr.zeros(types.float, PACKET * self._point_count)
         if self._pieces is not None:
-            self._pieces.write_transposed(gradient, sums)
+            self._pieces.write_transposed(gradient, sums, size)
         if self._parts is not None:
             dr.eval(sums)
             self._parts.write_transposed(type(sums)(sums), sums)
@@ -308,31 +312,31 @@ class CoefficientMap:
         return points_gradient if self._refinement is None else self._refinement.transposed(points_gradient)
 
 
-def _packet_blocks(
+def _piece_blocks(
     types: ArrayTypes,
     # Blocks of weights (b, m, K); index of the first control, number of patches, number of controls of a patch; first
-    # packet of the results, its distance from one block to the next, and from one patch to the next
+    # piece of the results, its distance from one block to the next, and from one patch to the next
     added: list[tuple[np.ndarray, int, int, int, int, int, int]],
     controls: IndexBuffer,
 ) -> WeightBlocks | None:
     """Blocks of weights for all patches of classes; None if there are none."""
     weights, table, row_count = {}, [], 0
-    for block_weights, first, count, control_count, *packets in added:
+    for block_weights, first, count, control_count, *pieces in added:
         if id(block_weights) not in weights:
             weights[id(block_weights)] = block_weights, row_count
             row_count += len(block_weights) * control_count
         _, row = weights[id(block_weights)]
-        table.append((len(block_weights), first, count, control_count, row, *packets))
+        table.append((len(block_weights), first, count, control_count, row, *pieces))
     if not table:
         return None
     block_counts, *data = np.array(table).T
     index = ragged.index_in_row(block_counts)
-    first, count, control_count, row, packet, block_step, patch_step = np.repeat(data, block_counts, axis=1)
+    first, count, control_count, row, piece, block_step, patch_step = np.repeat(data, block_counts, axis=1)
     # Successive controls of a patch are as far apart as the class has patches.
     columns = np.stack([first, count, control_count, row + index * control_count], axis=1)
     block, patch = np.repeat(np.arange(len(count)), count), ragged.index_in_row(count)
-    packets = (packet + index * block_step)[block] + patch * patch_step[block]
-    return WeightBlocks(types, [part for part, _ in weights.values()], columns, controls, block, patch, packets)
+    places = (piece + index * block_step)[block] + patch * patch_step[block]
+    return WeightBlocks(types, [part for part, _ in weights.values()], columns, controls, block, patch, places)
 
 
 class ControlValues:

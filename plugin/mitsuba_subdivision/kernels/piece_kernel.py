@@ -37,6 +37,7 @@ from ..patches.piece_table import (
     WHOLE,
     FrameKind,
     PieceTable,
+    piece_packets,
 )
 from .algebra import Monomials, added, combined, cross, like, selected
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Value, Vector3
@@ -190,12 +191,12 @@ class Piece:
         evaluate, has_frame = kernel.monomials.values, tip.frame_row is not None
 
         # A piece has a coordinate in place of each of its coefficients, and begins with the first coordinate.
-        width = kernel.count - 1
+        width, length = kernel.count - 1, kernel.length(size)
 
         def coordinate(number: Index, active: Mask = True) -> list[Float]:
             """Coordinate of the term after a number of others that are not the first."""
-            offset = tip.coordinates + number // width * kernel.numbers + number % width * 3
-            return [dr.gather(types.float, self.buffer, offset + i, active) for i in range(3, 3 + size)]
+            offset = tip.coordinates + number // width * length + number % width * size
+            return [dr.gather(types.float, self.buffer, offset + i, active) for i in range(size, 2 * size)]
 
         def add_term(k, *totals):
             factor = kernel.factor(tip.factor + k)
@@ -264,7 +265,7 @@ class PieceKernel:
         self.basis_functions = basis.matrix.T.tolist() if use_stam else None
         self.walk = ElementWalk(table, types)  # Over the table's elements
         self.count = len(basis.powers)
-        self.numbers, self._row_size = PACKET * table.packets_of_piece, -(-self.count // PACKET) * PACKET
+        self._row_size = -(-self.count // PACKET) * PACKET
         self._piece_levels = table.piece_levels
         self._patch_starts, self._nodes = types.indices(table.patch_starts), types.indices(table.nodes)
         kinds = table.nodes[:, 0] & KINDS
@@ -284,7 +285,7 @@ class PieceKernel:
         v: Float,
         active: Mask = True,
         row: Index4 | None = None,  # `ElementWalk.row` of the half-edges, if known
-        size: int = 3,  # Number of components of a coefficient to fetch
+        size: int = 3,  # Number of components of a coefficient
     ) -> Piece:
         """The piece that contains given parameters."""
         types, domain = self.types, self.domain
@@ -309,7 +310,7 @@ class PieceKernel:
             is_tip = (kind & KINDS) == _TIP
             level_count, term_count = tip_code // LEVEL & LEVELS, tip_code // TERM
             level, child, u, v, scale = self._at_level(is_tip, level_count, u, v, scale)
-            coordinates = (number + LEVEL_PIECES * self._piece_levels) * self.numbers
+            coordinates = (number + LEVEL_PIECES * self._piece_levels) * self.length(size)
             number += child
             is_deep = active & is_tip & (level >= self._piece_levels)
             is_piece = active & ~is_deep
@@ -326,12 +327,12 @@ class PieceKernel:
                 frame_factor = factor + dr.select(is_uneven, (level_count + 1) * term_count, 0)
                 frames = frame_row, frame_factor, needs_frame, is_uneven
             tip = TipTerms(dr.select(is_deep, term_count, 0), coordinates, row, factor, *frames)
-        numbers = types.row(buffer, self.numbers, number, is_piece)
+        numbers = types.row(buffer, self.length(size), number, is_piece)
         a, b, c, d = turn_matrix(domain, types, (turn + quarter) % domain.corner_count)
         return Piece(
             self,
             buffer,
-            [numbers[i : 3 * self.count : 3] for i in range(size)],
+            [numbers[i : size * self.count : size] for i in range(size)],
             u - self.centre[0],
             v - self.centre[1],
             (a * scale, b * scale, c * scale, d * scale),
@@ -339,6 +340,10 @@ class PieceKernel:
             tip,
             size,
         )
+
+    def length(self, size: int) -> int:
+        """Number of the coefficients of a piece of ``size`` components, with padding."""
+        return PACKET * piece_packets(self.count, size)
 
     def weights(self, row: Index, active: Mask = True) -> list:
         """Fetch a row of the blocks, with one weight for each monomial."""

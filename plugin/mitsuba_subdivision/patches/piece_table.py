@@ -112,15 +112,14 @@ class PieceTable:
 
     An element is identified by one of its half-edges, at which parameters start, as in `PatchSampler.evaluate`.
 
-    *Coefficients* depend on the control points. They are the polynomials of the pieces of all patches, three numbers
-    for each monomial, padded to whole packets.
+    *Coefficients* depend on the control points. They are the polynomials of the pieces of all patches, a number of each
+    component for each monomial, padded to whole packets.
     """
 
     patches: PatchTable
     control_count: int
     piece_levels: int  # Number of levels of tips that are stored as pieces
-    packets_of_piece: int  # Packets of the coefficients of a piece
-    packet_count: int  # Packets of all coefficients
+    piece_count: int
     patch_starts: NDArray[np.uint32]  # (p, 2) uint32: first piece and first node of each patch
     # (n, 4) uint32: `TreeArrays.nodes` of all classes, counted through all of them; for tips the first row of `weights`
     nodes: NDArray[np.uint32]
@@ -156,9 +155,9 @@ class PieceTable:
         counts, control_counts = np.array([len(kind.corners) for kind in table.classes]), table.control_counts
         # Building all trees in one call shares most of their data.
         elements = patch_trees(table.scheme, [kind.signature for kind in table.classes])
-        packets_of_piece = piece_packets(len(polynomial_basis(table.scheme).powers))
         tip_count = int(np.array([element.tip_count for element in elements]) @ counts)
-        bytes_of_level = 4 * PACKET * packets_of_piece * LEVEL_PIECES * tip_count
+        packet_count = piece_packets(len(polynomial_basis(table.scheme).powers)) * LEVEL_PIECES * tip_count
+        bytes_of_level = 4 * PACKET * packet_count
         if bytes_of_level:
             piece_levels = min(piece_levels, COEFFICIENT_BYTES // bytes_of_level)
         trees = [tree_arrays(element, piece_levels) for element in counted(elements, "Pieces of patch classes")]
@@ -181,8 +180,7 @@ class PieceTable:
             patches,
             control_count,
             piece_levels,
-            packets_of_piece,
-            packets_of_piece * piece_count,
+            piece_count,
             np.stack(starts, axis=1).astype(np.uint32),
             nodes.astype(np.uint32),
             tuple(elements),
@@ -226,9 +224,9 @@ class PieceTable:
 _TABLES: Shared[PieceTable] = Shared()
 
 
-def piece_packets(monomial_count: int) -> int:
-    """Packets of the coefficients of a piece, three numbers for each monomial."""
-    return -(-3 * monomial_count // PACKET)
+def piece_packets(monomial_count: int, size: int = 3) -> int:
+    """Packets of the coefficients of a piece, ``size`` numbers for each monomial."""
+    return -(-size * monomial_count // PACKET)
 
 
 # A tree takes up to some megabytes at high valences.
