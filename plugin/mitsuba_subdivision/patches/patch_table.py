@@ -121,6 +121,14 @@ class PatchTable:
             classes.append(PatchClass(signature, corners, class_controls, begin))
         return tuple(classes), controls
 
+    def forget(self) -> None:
+        """Drop what is computed again on demand, for a mesh that nothing is evaluated on but kernels made of it."""
+        refined = vars(self).get("refined")
+        for part in (self, self.topology, *([] if refined is None else [refined.table, refined.table.topology])):
+            for name in [name for name, value in vars(type(part)).items() if isinstance(value, cached_property)]:
+                if name != "refined":
+                    vars(part).pop(name, None)
+
     @property
     def patch_count(self) -> int:
         return len(self._patch_codes[0])

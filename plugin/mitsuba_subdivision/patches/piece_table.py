@@ -128,8 +128,7 @@ class PieceTable:
     # (c, 5) uint32, for each class: index of its first entry in `controls`; number of patches, and of controls per
     # patch; first piece; number of pieces per patch
     classes: NDArray[np.uint32]
-    # (n,) uint32: `PatchTable.controls` as indices of control values, or of refined ones if there is a `refinement`
-    controls: NDArray[np.uint32]
+    control_of_vertex: IntArray  # (n_v,) int64: 0-based control value at each mesh vertex
     # (n, control_count) matrix from control values to refined ones, if patches are those of the cage refined once
     refinement: sparse.csr_array | None
 
@@ -186,8 +185,14 @@ class PieceTable:
             tuple(elements),
             tips,
             np.stack(columns, axis=1).astype(np.uint32),
-            *patches.control_rows(control_of_vertex, control_count),
+            control_of_vertex,
+            patches.control_rows(control_of_vertex, control_count)[1],
         )
+
+    @property
+    def controls(self) -> NDArray[np.uint32]:
+        """``(n,)`` `PatchTable.controls` as indices of control values; of refined ones if there is a `refinement`."""
+        return self.patches.control_rows(self.control_of_vertex, self.control_count)[0]
 
     @property
     def trees(self) -> list[TreeArrays]:

@@ -76,6 +76,10 @@ class ExactShading:
             for name, channel in channels.items()
             if name == TEXCOORDS or channel.values.shape[1] in WIDTHS
         }
+        for layout in {channel.layout for channel in channels.values()}:
+            # Values with seams have a mesh of their own.
+            if layout.patches is not surface.patches:
+                layout.patches.forget()
         self._texcoords = self.channels.get(TEXCOORDS)
         self._attributes = {mesh_name(name): channel for name, channel in self.channels.items() if name != TEXCOORDS}
         sizes = {name: channel.values.size for name, channel in self._attributes.items()}
