@@ -127,6 +127,11 @@ def test_hidden_blocks_are_those_of_the_basis(sizes, hidden):
     np.testing.assert_allclose(basis.vectors @ blocks @ basis.inverse, matrix, rtol=0, atol=POWER)
     assert basis.eigenvalues[0] == 1
     assert np.abs(np.linalg.eigvals(blocks)).max() == pytest.approx(1)
+    left, right, factors = basis.power_terms(30)
+    sums = [basis.block_matrix(n) for n in range(30)]
+    np.testing.assert_allclose((left * factors[:, None]) @ right, sums, rtol=0, atol=RESIDUAL)
+    # Each block adds terms of the rank of its Jordan blocks or pairs.
+    assert len(right) - len(matrix) <= 4 * len(sizes)
 
 
 def test_of_opposite_eigenvalues_the_positive_comes_first():

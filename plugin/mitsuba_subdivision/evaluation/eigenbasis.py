@@ -68,14 +68,19 @@ class Eigenbasis:
         Returns left (K, t), right (t, K) and factors (count, t).
         """
         size, exponents = len(self.eigenvalues), np.arange(count)
-        left, right, factors = [np.eye(size)], [np.eye(size)], [self.eigenvalues ** exponents[:, None]]
+        left: list[FloatArray] = [np.eye(size)]
+        right: list[FloatArray] = [np.eye(size)]
+        factors: list[FloatArray] = [self.eigenvalues ** exponents[:, None]]
         for block_slice, block in self.blocks:
             mean, identity = self.eigenvalues[block_slice.start], np.eye(len(block))
-            added = np.stack([np.linalg.matrix_power(block, n) - mean**n * identity for n in exponents.tolist()])
-            columns, sizes, _ = np.linalg.svd(np.hstack(added), full_matrices=False)
-            columns, rows = columns[:, sizes > DIAGONAL], np.linalg.svd(np.vstack(added), full_matrices=False)[2]
-            rank = columns.shape[1]
-            rows = rows[:rank]
+            powers = [np.linalg.matrix_power(block, n) - mean**n * identity for n in exponents.tolist()]
+            added: FloatArray = np.stack(powers)
+            columns, sizes, _ = np.linalg.svd(added.swapaxes(0, 1).reshape(len(block), -1), full_matrices=False)
+            rank = int(np.count_nonzero(sizes > DIAGONAL))
+            columns, rows = (
+                columns[:, :rank],
+                np.linalg.svd(added.reshape(-1, len(block)), full_matrices=False)[2][:rank],
+            )
             left.append(np.repeat(np.eye(size)[:, block_slice] @ columns, rank, axis=1))
             right.append(np.tile(rows @ np.eye(size)[block_slice], (rank, 1)))
             factors.append((columns.T @ added @ rows.T).reshape(count, -1))
@@ -188,6 +193,9 @@ def _subspace(
     Where the eigenvectors are dependent, it is computed by block inverse iteration.
     """
     vectors, count = eigenvectors[:, members], len(members)
+    if count == 1:
+        # A simple eigenvalue; of a real matrix it is real, and so is its unit vector.
+        return vectors.real
     left, singular, _ = np.linalg.svd(np.hstack([vectors.real, vectors.imag]), full_matrices=False)
     block: FloatArray = left[:, :count]
     if singular[count - 1] >= DEPENDENT:

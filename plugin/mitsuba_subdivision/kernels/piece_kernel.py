@@ -222,7 +222,7 @@ class Piece:
         )
         value_sum, *derivative_sums = (totals[i : i + size] for i in range(0, sum_count, size))
         is_deep = tip.count > 0
-        first = [dr.gather(types.float, self.buffer, tip.coordinates + i, is_deep) for i in range(size)]
+        first: list[Float] = [dr.gather(types.float, self.buffer, tip.coordinates + i, is_deep) for i in range(size)]
         point = added(first, value_sum)
         value, *partials = (
             added(vector, change) for vector, change in zip((value, *partials), (point, *derivative_sums), strict=False)

@@ -251,7 +251,7 @@ def tree_arrays(
         maps.append(PieceMap(piece_count, stencils, pieces))
         piece_count += len(pieces)
     # In nodes of tips, `first` is the index in `PatchTree.tips`.
-    tip_nodes, tips = np.flatnonzero(kinds == PartKind.TIP), []
+    tip_nodes, tips = np.flatnonzero(kinds == PartKind.TIP), list[Tip]()
     for node, piece in zip(tip_nodes[np.argsort(first[tip_nodes])].tolist(), element.tips, strict=True):
         tip, of_levels = _tip(scheme, piece.irregular_patch), _tip_pieces(scheme, piece.irregular_patch, piece_levels)
         first[node], index[node] = piece_count, len(tips)
