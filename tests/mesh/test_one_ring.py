@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision.mesh import ragged
-from mitsuba_subdivision.mesh.one_ring import one_ring
+from mitsuba_subdivision.mesh.one_ring import Surroundings, one_ring
 from mitsuba_subdivision.mesh.signature import Fan, Signature, signature_at
 from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, polygons, torus
 from reference.exact_samples import mesh_of
@@ -62,7 +62,7 @@ def test_gathered_ring_is_a_map_of_meshes(topology, kind):
         faces |= {face[i:] + face[:i]: index for i in range(len(face))}
     for half_edge in half_edges_of(topology):
         ring = one_ring(signature_at(topology, half_edge, kind))
-        controls = ring.gather(topology, np.array([half_edge]))[0]
+        controls = ring.gather(Surroundings(topology), np.array([half_edge]))[0]
         local = ring.topology
         element = element_vertices(topology, half_edge, kind)
         assert tuple(controls[: len(element)]) == element
@@ -85,9 +85,9 @@ def test_many_elements_gather_as_each_alone(topology, kind, monkeypatch):
         classes.setdefault(signature_at(topology, half_edge, kind), []).append(half_edge)
     for signature, members in classes.items():
         ring = one_ring(signature)
-        alone = [ring.gather(topology, np.array([member]))[0] for member in members]
+        alone = [ring.gather(Surroundings(topology), np.array([member]))[0] for member in members]
         assert alone[0].shape == (ring.vertex_count,)
-        np.testing.assert_array_equal(ring.gather(topology, np.array(members)), alone)
+        np.testing.assert_array_equal(ring.gather(Surroundings(topology), np.array(members)), alone)
 
 
 @pytest.mark.parametrize("sharpness", [9.99, 10.0, 20.0])
@@ -102,7 +102,7 @@ def test_corners_of_sharpness_ten_are_not_semi_sharp(sharpness):
 def test_faces_that_meet_at_a_vertex_of_valence_2_are_joined_along_both_edges():
     topology = cube_with_valence_2().topology
     ring = one_ring(signature_at(topology, 0, "face"))
-    controls = ring.gather(topology, np.array([0]))[0]
+    controls = ring.gather(Surroundings(topology), np.array([0]))[0]
     assert ring.topology.face_vertices[3] == 3
     assert controls[3] == 8
     assert ring.topology.vertex_face_count[3] == 2

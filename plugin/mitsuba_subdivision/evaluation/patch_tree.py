@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.connectivity import INFINITE, IndexArray, IntArray, VertexRule
-from ..mesh.one_ring import joined_rings, one_ring
+from ..mesh.one_ring import OneRing, Surroundings, joined_rings, one_ring, one_rings
 from ..mesh.signature import Fan, Signature, signatures_at
 from ..schemes.domain import IDENTITY, FloatArray, ParameterMap
 from ..schemes.scheme import Scheme, SchemeError
@@ -257,12 +257,13 @@ def refined_children(scheme: Scheme, signatures: Sequence[Signature]) -> list[li
     half_edges = np.array([half_edge for *_, half_edge in parts])
     of_parts = signatures_at(refined, half_edges, scheme.element)
     # Control points of children of equal connectivity are gathered at once.
-    alike: dict[Signature, list[int]] = {}
-    for index, signature in enumerate(of_parts):
-        alike.setdefault(signature.smoothed, []).append(index)
+    alike: dict[OneRing, list[int]] = {}
+    for index, ring in enumerate(one_rings(of_parts)):
+        alike.setdefault(ring, []).append(index)
     controls: dict[int, IndexArray] = {}
-    for signature, indices in alike.items():
-        controls |= zip(indices, one_ring(signature).gather(refined, half_edges[indices]), strict=True)
+    surroundings = Surroundings(refined)
+    for ring, indices in alike.items():
+        controls |= zip(indices, ring.gather(surroundings, half_edges[indices]), strict=True)
 
     # A row for each control point of each child, as long as the one-ring of the parent has vertices.
     of_children = [controls[index] for index in range(len(parts))]
@@ -357,7 +358,7 @@ def rotation_order(signature: Signature, corner: int) -> NDArray[np.int64]:
     half_edge = 0
     for _ in range(corner):
         half_edge = int(ring.topology.next[half_edge] if signature.kind == "face" else ring.topology.turn[half_edge])
-    return one_ring(signature.rotated(corner)).gather(ring.topology, np.array([half_edge]))[0]
+    return one_ring(signature.rotated(corner)).gather(Surroundings(ring.topology), np.array([half_edge]))[0]
 
 
 @lru_cache(maxsize=1024)

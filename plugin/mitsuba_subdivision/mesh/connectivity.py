@@ -337,6 +337,12 @@ class Topology:
                 vars(same)[name] = value
         return same
 
+    def along_faces(self, half_edges: IntArray, counts: IntArray) -> NDArray[np.int64]:
+        """Return ``(counts.sum(),)``: for each half-edge ``counts`` successive ones of its face, from itself on."""
+        rows, face = ragged.ranges(half_edges, counts), self.face[half_edges]
+        is_past = rows >= np.repeat(self.face_offsets[1:][face], counts)
+        return rows - is_past * np.repeat(self.face_sizes[face], counts)
+
     def half_edges_of(self, is_chosen: NDArray[np.bool_]) -> IntArray:
         """Return the half-edges of the faces selected by ``is_chosen``, in ascending order."""
         return np.flatnonzero(np.repeat(is_chosen, self.common_size or self.face_sizes))

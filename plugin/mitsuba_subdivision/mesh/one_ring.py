@@ -3,38 +3,74 @@
 The faces around the corners of the element are glued where they are the same face. A one-ring is *unfolded*: a vertex
 of a small cage may occur several times as different vertices of the local mesh. Stencils over an unfolded ring are
 still correct, because the weights of equal vertices add up.
+
+Scans have hundreds of signatures, so the rings of many are glued side by side, as one mesh.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import ragged
 from .connectivity import IndexArray, IntArray, SemiSharpness, Topology
-from .signature import NEAR_FACES, Fan, Signature
+from .signature import Fan, Signature
 
-# Steps from one half-edge to another: to the next one of its face, and to its twin.
-NEXT, TWIN = range(2)
+# Number of one-rings that are kept for later calls.
+MOST_RINGS = 4096
+_RINGS: dict[Signature, OneRing] = {}
+
+
+class Surroundings:
+    """The vertices around each vertex of a mesh, face by face counter-clockwise, in one array.
+
+    Each face has those after its next vertex's half-edge up to, but without, its previous vertex, which is the first of
+    the following face. Around inner vertices all are listed twice, so that they go all around from any face.
+    """
+
+    def __init__(self, topology: Topology) -> None:
+        self.topology = t = topology
+        is_open, ordered = t.open_fan_start >= 0, list[IntArray]()
+        first, kinds = np.where(is_open, t.open_fan_start, t.vertex_half_edge), 2 * t.vertex_face_count + is_open
+        for kind in np.flatnonzero(np.bincount(kinds)[2:]).tolist():
+            fans = [first[kinds == kind + 2]]
+            for _ in range(kind // 2):
+                fans.append(t.turn.take(fans[-1]))
+            ordered.append(np.stack(fans if kind % 2 else 2 * fans, axis=1).ravel())
+        half_edge = np.concatenate(ordered)
+        counts = (np.full_like(half_edge, t.common_size) if t.common_size else t.face_sizes[t.face[half_edge]]) - 2
+        begins = ragged.starts(counts)
+        # (n_h,) int32: index in `vertices` at which the half-edge's face begins, around the half-edge's first vertex.
+        # Assigned backwards, as the last assignment is kept.
+        self.start: IndexArray = np.zeros(t.half_edge_count, dtype=np.int32)
+        self.start[half_edge[::-1]] = begins[::-1]
+        self.vertices: IndexArray = np.empty(int(counts.sum()), dtype=np.int32)
+        for step in range(int(counts.max(initial=0))):
+            if not t.common_size:
+                is_long = counts > step
+                half_edge, counts, begins = half_edge[is_long], counts[is_long], begins[is_long]
+            half_edge = t.next.take(half_edge)
+            self.vertices[begins + step] = t.face_vertices.take(half_edge)
 
 
 @dataclass(frozen=True, eq=False)
 class OneRing:
-    """An unfolded one-ring: its local mesh, and a way from the element to its vertices."""
+    """An unfolded one-ring: its local mesh, and the places of its vertices around the corners of the element."""
 
     # The local mesh, which has a border. Half-edge 0 names the element; the vertices of the element come first.
     topology: Topology
-    around: list[list[int]]  # Half-edges of the fan at each corner of the element, from the most clockwise one on
-    # For each local half-edge but 0, in the order of a walk, the half-edge before it and the step from there
-    way: dict[int, tuple[int, int]]
-    # Local vertices (corner, first, last) for each corner of the element whose fan may lack faces (`Fan.near`); first
-    # and last are its `Topology.border_neighbours`
-    cut_fans: list[tuple[int, int, int]]
+    around: list[IntArray]  # Half-edges of the fan at each corner of the element, from the most clockwise one on
+    # (K - c,) int64 each, for the vertices after those at the c corners: a corner that has the vertex around it, and
+    # how far it comes after `Surroundings.start` of the corner
+    corner: IntArray
+    offset: IntArray
+    # Local vertices (corner, first, last) for each corner of the element on a border; first and last are its
+    # `Topology.border_neighbours`, also where its fan lacks faces (`Fan.near`)
+    open_fans: list[tuple[int, int, int]]
 
     @property
     def vertex_count(self) -> int:
@@ -50,80 +86,175 @@ class OneRing:
 
     def gather(
         self,
-        topology: Topology,
+        surroundings: Surroundings,
         half_edges: IndexArray,  # (e,) int32: the half-edge that names each element
         # (K, e) int32: output array; the result is a transposed view of it
         columns: NDArray[np.int32] | None = None,
     ) -> NDArray[np.int32]:
-        """Find the vertices of ``topology`` in the one-rings of many elements of this signature.
+        """Find the vertices of a mesh in the one-rings of many elements of this signature.
 
         Returns (e, K) int32.
         """
         # Often the largest array of all. It is filled by local vertices, so these are along the first axis.
         if columns is None:
             columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
-        tables, first_half_edges = (topology.next, topology.twin), self.topology.vertex_half_edge.tolist()
-        for part in ragged.chunks_of(len(half_edges)):
-            reached = {0: half_edges[part]}
-            for half_edge, (before, step) in self.way.items():
-                reached[half_edge] = tables[step].take(reached[before])
-            for column, half_edge in zip(columns[:, part], first_half_edges, strict=True):
-                topology.face_vertices.take(reached[half_edge], out=column, mode="clip")
-        for centre, first, last in self.cut_fans:
-            columns[first], columns[last] = topology.border_neighbours(columns[centre])
+        t, corner_count = surroundings.topology, len(self.around)
+        for part in ragged.chunks_of(len(half_edges), 8):
+            corners = [half_edges[part]]
+            for _ in range(corner_count - 1):
+                corners.append(t.next.take(corners[-1]))
+            t.face_vertices.take(corners, out=columns[:corner_count, part], mode="clip")
+            index = surroundings.start.take(corners).take(self.corner, axis=0) + self.offset[:, None]
+            surroundings.vertices.take(index, out=columns[corner_count:, part], mode="clip")
+        for centre, first, last in self.open_fans:
+            columns[first], columns[last] = t.border_neighbours(columns[centre])
         return columns.T
 
 
-@lru_cache(maxsize=4096)
 def one_ring(signature: Signature) -> OneRing:
-    """Return the unfolded one-ring of a signature; semi-sharp features change nothing.
+    """Return the unfolded one-ring of a signature."""
+    return one_rings([signature])[0]
 
-    The faces around each corner are glued along the edges at the corner, and nowhere else. Two walks lead to the same
-    face only if both cross the same edge of another face.
+
+def one_rings(signatures: Iterable[Signature]) -> list[OneRing]:
+    """Return the unfolded one-rings of signatures; semi-sharp features change nothing."""
+    smooth = [signature.smoothed for signature in signatures]
+    rings = {signature: _RINGS[signature] for signature in smooth if signature in _RINGS}
+    if missing := [signature for signature in dict.fromkeys(smooth) if signature not in rings]:
+        if len(_RINGS) + len(missing) > MOST_RINGS:
+            _RINGS.clear()
+        rings |= zip(missing, _glued_rings(missing), strict=True)
+        _RINGS.update(rings)
+    return [rings[signature] for signature in smooth]
+
+
+def _glued_rings(signatures: Sequence[Signature]) -> list[OneRing]:
+    """Glue the faces around elements along the edges at their corners, and nowhere else.
+
+    A walk starts in the element, turns about one of its corners by a number of faces, and arrives at a face. Walks
+    about neighbouring corners may arrive at the same face. In a quadrilateral mesh the walks (corner, turns) are::
+
+        +-----------+-----------+-----------+
+        |    3,2    | 2,3 = 3,1 |    2,2    |
+        +-----------3-----------2-----------+
+        |           | 0,0 = 1,0 |           |
+        | 0,1 = 3,3 | 2,0 = 3,0 | 1,3 = 2,1 |
+        +-----------0-----------1-----------+
+        |    0,2    | 0,3 = 1,1 |    1,2    |
+        +-----------+-----------+-----------+
+
+    Walks without turns stay in the element. Every other walk initially has a separate face, whose half-edges are
+    numbered from the one that begins at the walk's corner. Then faces are glued along the edges that the walks cross.
+    Faces are sorted by the first walk to each, by its corner, then by its turns, so that the element comes first.
     """
-    if signature.is_semi_sharp:
-        return one_ring(signature.smoothed)
-    fans = signature.fans
-    sizes, following, preceding, twin, around = _glued_faces(signature)
-    # Vertices are numbered by their first half-edges.
-    vertex, first = [-1] * len(twin), list[int]()
-    for half_edge in range(len(twin)):
-        if vertex[half_edge] >= 0:
-            continue
-        first.append(half_edge)
-        same = [half_edge]
-        while same:
-            current = same.pop()
-            if current >= 0 and vertex[current] < 0:
-                vertex[current] = len(first) - 1
-                same.append(twin[preceding[current]])
-                if twin[current] >= 0:
-                    same.append(following[twin[current]])
+    fans = [fan for signature in signatures for fan in signature.fans]
+    corner_counts = np.array([len(signature.fans) for signature in signatures])
+    first_fan, corner_of_fan = ragged.starts(corner_counts), ragged.index_in_row(corner_counts)
+    # The walks about each corner, from the most clockwise one on.
+    counts, behind = np.array([(fan.face_count, len(fan.behind or ())) for fan in fans]).T
+    sizes = np.fromiter(chain.from_iterable((*(fan.behind or ())[::-1], *fan.ahead) for fan in fans), dtype=np.int64)
+    fan_of_walk = np.repeat(np.arange(len(fans)), counts)
+    turns = ragged.index_in_row(counts) - behind[fan_of_walk]
+    stays = np.flatnonzero(turns == 0)
+    has_face = turns != 0
+    has_face[stays[first_fan]] = True
+    order = np.lexsort((turns, np.abs(turns), fan_of_walk))
+    order = order[has_face[order]]
+    apart = Topology(0, sizes[order], np.zeros(sizes[order].sum()))
+    walks = np.zeros_like(turns)
+    walks[order] = apart.face_offsets[:-1]
+    walks[stays] = np.repeat(walks[stays[first_fan]], corner_counts) + corner_of_fan
+
+    # A turn counter-clockwise crosses the last edge of the face, which is the first edge of the next face.
+    last = np.cumsum(counts) - 1
+    after, is_crossing = np.roll(walks, -1), np.ones(len(walks), dtype=bool)
+    after[last], is_crossing[last] = walks[last - counts + 1], [fan.is_closed for fan in fans]
+    lowest, twin = _equal_half_edges(apart, apart.prev[walks[is_crossing]], after[is_crossing])
+    kept = np.flatnonzero(lowest == np.arange(len(lowest)))
+    number = np.full(len(lowest) + 1, len(kept))
+    number[kept] = np.arange(len(kept))
+    walks = number[lowest[walks]]
     # Edges are named by half-edges, not by vertices, so that the two sides of a crease stay separate even where the
     # ring closes around the end of the crease.
-    edge_names = [min(half_edge, other) if other >= 0 else half_edge for half_edge, other in enumerate(twin)]
-    rules = np.zeros(len(first), dtype=np.int8)
-    rules[vertex[: len(fans)]] = [fan.rule for fan in fans]
-    local = Topology(len(first), np.array(sizes), np.array(vertex), np.array(edge_names), rules)
-    cut_fans = [
-        (vertex[half_edges[0]], vertex[following[half_edges[0]]], vertex[preceding[half_edges[-1]]])
-        for half_edges, fan in zip(around, fans, strict=True)
-        if fan.is_open and fan.face_count == NEAR_FACES
-    ]
-    return OneRing(local, around, _way(sizes, following, twin), cut_fans)
+    names = np.minimum(np.arange(len(kept)), number[twin[kept]])
+    glued = Topology(0, apart.face_sizes[lowest[apart.face_offsets[:-1]] == apart.face_offsets[:-1]], 0 * kept, names)
+
+    # Vertices are numbered by their first half-edges.
+    first = np.arange(len(kept))
+    for turn in (glued.turn, glued.turn_back):
+        step = np.where(turn < 0, np.arange(len(kept)), turn)
+        for _ in range(int(np.add.reduceat(counts, first_fan).max()).bit_length()):
+            first, step = np.minimum(first, first[step]), step[step]
+    is_first = first == np.arange(len(kept))
+    vertex = (np.cumsum(is_first) - 1)[first]
+    rules = np.zeros(np.count_nonzero(is_first), dtype=np.int8)
+    rules[vertex[walks[stays]]] = [fan.rule for fan in fans]
+
+    # Vertices around the corners, as in `Surroundings`.
+    counts_ahead = sizes - 2
+    begins = ragged.starts(counts_ahead)
+    walk, step = np.repeat(np.arange(len(walks)), counts_ahead), ragged.index_in_row(counts_ahead)
+    listed = vertex[glued.along_faces(glued.next[walks], counts_ahead)].astype(np.int32)
+    place = ragged.first_indices(listed, len(rules))
+    # Those without a place are the last ones of open fans.
+    corner = np.where(place < 0, 0, corner_of_fan[fan_of_walk[walk[place]]])
+    offset = np.where(place < 0, 0, step[place] + (begins - begins[stays[fan_of_walk]])[walk[place]])
+
+    # Each ring begins with its element.
+    half_edges = np.append(walks[stays[first_fan]], len(kept))
+    faces, vertices = np.append(glued.face, glued.face_count)[half_edges], np.append(vertex, len(rules))[half_edges]
+    local_vertex = (vertex - np.repeat(vertices[:-1], np.diff(half_edges))).astype(np.int32)
+    names -= np.repeat(half_edges[:-1], np.diff(half_edges))
+    around = np.split(walks - np.repeat(half_edges[:-1], corner_counts)[fan_of_walk], last[:-1] + 1)
+    ends = local_vertex[np.stack([glued.next[walks[last - counts + 1]], glued.prev[walks[last]]], axis=1)].tolist()
+    spans = (pairwise(offsets.tolist()) for offsets in (faces, half_edges, vertices))
+    rings = []
+    for signature, fan, of_faces, of_edges, of_vertices in zip(signatures, first_fan.tolist(), *spans, strict=True):
+        corners, slots = range(len(signature.fans)), slice(*of_edges)
+        topology = Topology(
+            of_vertices[1] - of_vertices[0],
+            glued.face_sizes[slice(*of_faces)],
+            local_vertex[slots],
+            names[slots],
+            rules[slice(*of_vertices)],
+        )
+        others = slice(of_vertices[0] + len(corners), of_vertices[1])
+        open_fans = [(corner, *ends[fan + corner]) for corner in corners if not signature.fans[corner].is_closed]
+        rings.append(OneRing(topology, around[fan : fan + len(corners)], corner[others], offset[others], open_fans))
+    return rings
 
 
-def _way(sizes: list[int], following: list[int], twin: list[int]) -> dict[int, tuple[int, int]]:
-    """Return `OneRing.way`. It enters each face across the first edge that leads there from an earlier one."""
-    way, begin = dict[int, tuple[int, int]](), 0
-    for size in sizes:
-        half_edge = next((h for h in range(begin, begin + size) if 0 <= twin[h] < begin), begin)
-        way[half_edge] = twin[half_edge], TWIN
-        while (after := following[half_edge]) not in way:
-            way[after], half_edge = (half_edge, NEXT), after
-        begin += size
-    del way[0]
-    return way
+def _equal_half_edges(apart: Topology, one: IntArray, other: IntArray) -> tuple[IntArray, IntArray]:
+    """Make pairs of half-edges twins, in a mesh of separate faces.
+
+    If a half-edge is to be the twin of two, the two are the same half-edge, and their faces are the same face. Then
+    their twins are the same, too. Sets of equal half-edges are represented by their lowest member.
+
+    Returns ``(n_h,)`` the lowest half-edge that is equal to each one; and the twin of each that is the lowest, ``n_h``
+    for none.
+    """
+    count, face, begin = apart.half_edge_count, apart.face, apart.face_offsets
+    index = np.arange(count) - begin[face]
+    one, other = np.concatenate([one, other]), np.concatenate([other, one])
+    lowest = np.arange(count)
+    while True:
+        twin, ends = np.full(count, count), lowest[other]
+        np.minimum.at(twin, lowest[one], ends)
+        lower = twin[lowest[one]]
+        differs = face[lower] != face[ends]
+        if not differs.any():
+            return lowest, twin
+        ends, lower = ends[differs], lower[differs]
+        # For each face that is equal to a lower one, the half-edge there that is its own first one.
+        images = np.full(apart.face_count, count)
+        turned = begin[face[lower]] + (index[lower] - index[ends]) % apart.face_sizes[face[lower]]
+        np.minimum.at(images, face[ends], turned)
+        moved = np.flatnonzero(images[face] < count)
+        image, step = images[face[moved]], np.arange(count)
+        step[moved] = begin[face[image]] + (index[image] + index[moved]) % apart.face_sizes[face[image]]
+        while (step != (step := step[step])).any():
+            pass
+        lowest = step[lowest]
 
 
 def joined_rings(signatures: Sequence[Signature]) -> tuple[Topology, IntArray, IntArray]:
@@ -132,7 +263,7 @@ def joined_rings(signatures: Sequence[Signature]) -> tuple[Topology, IntArray, I
     Returns the mesh; ``(r,)`` half-edge 0 of each ring, which names its element; and ``(r + 1,)`` offsets of vertices:
     those of ring ``i`` are ``offsets[i]`` up to ``offsets[i + 1]``.
     """
-    rings = [one_ring(signature) for signature in signatures]
+    rings = one_rings(signatures)
     parts = [ring.topology for ring in rings]
     half_edges, vertices = (
         ragged.offsets(counts)
@@ -143,12 +274,12 @@ def joined_rings(signatures: Sequence[Signature]) -> tuple[Topology, IntArray, I
         int(vertices[-1]),
         np.concatenate([part.face_sizes for part in parts]),
         np.concatenate([part.face_vertices for part in parts]) + np.repeat(vertices[:-1], counts),
-        np.concatenate([part.edge for part in parts]) + np.repeat(half_edges[:-1], counts),
+        np.concatenate([part.edge_names for part in parts]) + np.repeat(half_edges[:-1], counts),
         np.concatenate([part.vertex_rules for part in parts]),
     )
     if any(signature.is_semi_sharp for signature in signatures):
         fans = [
-            (fan, half_edge + np.array(around))
+            (fan, half_edge + around)
             for signature, ring, half_edge in zip(signatures, rings, half_edges.tolist(), strict=False)
             for fan, around in zip(signature.fans, ring.around, strict=True)
             if fan.is_semi_sharp
@@ -180,89 +311,4 @@ def _semi_sharpness(
     vertex, across_sharpness, across_refined, sharpens = np.array(across, dtype=float).reshape(-1, 4).T
     return SemiSharpness(
         edges, refined, vertices, vertex.astype(np.int64), across_sharpness, across_refined, sharpens > 0
-    )
-
-
-def _glued_faces(signature: Signature) -> tuple[list[int], list[int], list[int], list[int], list[list[int]]]:
-    """Glue the faces around an element along the edges at its corners.
-
-    A walk starts in the element, turns about one of its corners by a number of faces, and arrives at a face. Walks
-    about neighbouring corners may arrive at the same face. In a quadrilateral mesh the walks (corner, turns) are::
-
-        +-----------+-----------+-----------+
-        |    3,2    | 2,3 = 3,1 |    2,2    |
-        +-----------3-----------2-----------+
-        |           | 0,0 = 1,0 |           |
-        | 0,1 = 3,3 | 2,0 = 3,0 | 1,3 = 2,1 |
-        +-----------0-----------1-----------+
-        |    0,2    | 0,3 = 1,1 |    1,2    |
-        +-----------+-----------+-----------+
-
-    Walks without turns stay in the element. Every other walk initially has a separate face, whose half-edges are
-    numbered from the one that begins at the walk's corner. Then faces are glued along the edges that the walks cross.
-    If a half-edge is to be glued to a second half-edge, the first and the second are the same half-edge, and their
-    faces are the same face. Sets of equal half-edges are represented by their lowest member (union-find), which belongs
-    to the first walk that arrives at the face.
-
-    Returns the sizes of the faces; the next half-edge, the previous one and the twin of each half-edge, -1 for none;
-    and `OneRing.around`. Faces are sorted by the first walk to each, by its corner, then by its turns, so that the
-    element comes first.
-    """
-    sizes: list[int] = []
-    following: list[int] = []
-    preceding: list[int] = []
-    face: list[int] = []
-    # For each corner, the half-edge of each face that begins there, from the most clockwise face on.
-    around: list[list[int]] = []
-    for corner, fan in enumerate(signature.fans):
-        begins = {0: corner} if corner else {}
-        for turns in sorted(fan.turns, key=lambda turns: (abs(turns), turns)):
-            if turns not in begins:
-                begin, size = len(face), fan.size(turns)
-                following += [*range(begin + 1, begin + size), begin]
-                preceding += [begin + size - 1, *range(begin, begin + size - 1)]
-                face += [len(sizes)] * size
-                sizes.append(size)
-                begins[turns] = begin
-        around.append([begins[turns] for turns in fan.turns])
-
-    twin = [-1] * len(face)
-    # An equal half-edge that is lower, or the half-edge itself.
-    lower = list(range(len(face)))
-
-    def lowest(half_edge: int) -> int:
-        while lower[half_edge] != half_edge:
-            half_edge = lower[half_edge]
-        return half_edge
-
-    # Pairs of half-edges to be made twins. A turn counter-clockwise crosses the last edge of the face, which is the
-    # first edge of the next face.
-    glued = [
-        (preceding[before], after)
-        for half_edges, fan in zip(around, signature.fans, strict=True)
-        for before, after in pairwise([*half_edges, half_edges[0]] if fan.is_closed else half_edges)
-    ]
-    for first, second in glued:
-        one, other = lowest(first), lowest(second)
-        for half_edge, same in ((twin[one], other), (twin[other], one)):
-            if half_edge < 0:
-                continue
-            kept, dropped = sorted((lowest(half_edge), lowest(same)))
-            # Unite the half-edges, and the others of their faces.
-            while face[kept] != face[dropped]:
-                lower[dropped] = kept
-                if twin[dropped] >= 0:
-                    glued.append((kept, twin[dropped]))
-                kept, dropped = sorted((lowest(following[kept]), lowest(following[dropped])))
-        one, other = lowest(one), lowest(other)
-        twin[one], twin[other] = other, one
-
-    is_lowest = [low == half_edge for half_edge, low in enumerate(lower)]
-    number = {half_edge: index for index, half_edge in enumerate(np.flatnonzero(is_lowest).tolist())}
-    return (
-        [sizes[index] for index in dict.fromkeys(face[half_edge] for half_edge in number)],
-        [number[following[half_edge]] for half_edge in number],
-        [number[preceding[half_edge]] for half_edge in number],
-        [number[lowest(twin[half_edge])] if twin[half_edge] >= 0 else -1 for half_edge in number],
-        [[number[lowest(half_edge)] for half_edge in half_edges] for half_edges in around],
     )

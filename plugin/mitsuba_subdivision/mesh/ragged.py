@@ -59,7 +59,7 @@ def chunks_of(count: int, parts: int = 1) -> Iterator[slice]:
 
     Slices are ``parts`` times shorter, for entries of as many parts.
     """
-    length = CHUNK_LENGTH // parts
+    length = max(1, CHUNK_LENGTH // parts)
     for begin in range(0, count, length):
         yield slice(begin, min(begin + length, count))
 

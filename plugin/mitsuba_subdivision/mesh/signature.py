@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -148,60 +149,61 @@ class Signature:
 
 def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signature:
     """Return the signature of one element."""
-    corners = _corners(topology, half_edge, kind)
-    return Signature(kind, tuple(_fan_at(topology, corner) for corner in corners))
+    return signatures_at(topology, np.array([half_edge]), kind)[0]
 
 
-def signatures_at(topology: Topology, half_edges: IntArray, kind: ElementKind) -> list[Signature]:
-    """Return the signatures of many elements of a small mesh. Equal fans are the same object."""
-    codes, fans, signatures = fan_codes(topology), dict[int, Fan](), list[Signature]()
-    for half_edge in half_edges.tolist():
-        corners = _corners(topology, half_edge, kind)
-        corner_codes = codes[corners].tolist()
-        for corner, code in zip(corners, corner_codes, strict=True):
-            if code not in fans:
-                fans[code] = _fan_at(topology, corner)
-        signatures.append(Signature(kind, tuple(fans[code] for code in corner_codes)))
-    return signatures
+def signatures_at(
+    topology: Topology,
+    half_edges: IntArray,
+    kind: ElementKind,
+    codes: IntArray | None = None,  # (n_h,) int: equal for equal fans only, by default `fan_codes`
+) -> list[Signature]:
+    """Return the signatures of many elements. Equal ones are the same object."""
+    counts = topology.face_sizes[topology.face[half_edges]] if kind == "face" else np.ones(len(half_edges), dtype=int)
+    corners = topology.along_faces(half_edges, counts)
+    codes = (fan_codes(topology) if codes is None else codes)[corners]
+    _, first, number = np.unique(codes, return_index=True, return_inverse=True)
+    fans, numbers, signatures = _fans_at(topology, corners[first]), number.tolist(), dict[tuple[int, ...], Signature]()
+    keys = [tuple(numbers[begin:end]) for begin, end in pairwise(ragged.offsets(counts).tolist())]
+    for key in dict.fromkeys(keys):
+        signatures[key] = Signature(kind, tuple(fans[number] for number in key))
+    return [signatures[key] for key in keys]
 
 
-def _corners(topology: Topology, half_edge: int, kind: ElementKind) -> list[int]:
-    """Return the half-edges that begin at an element's corners, counter-clockwise."""
-    corners = [half_edge]
-    if kind == "face":
-        while (corner := int(topology.next[corners[-1]])) != half_edge:
-            corners.append(corner)
-    return corners
-
-
-def _fan_at(topology: Topology, half_edge: int) -> Fan:
-    """Return the fan around the vertex at which a half-edge begins, from the half-edge's face on."""
+def _fans_at(topology: Topology, half_edges: IntArray) -> list[Fan]:
+    """Return the fans around the vertices at which half-edges begin, from the half-edges' faces on."""
     t, semi = topology, topology.semi_sharpness
-    ahead, behind = [half_edge], list[int]()
-    while (current := int(t.turn[ahead[-1]])) not in (half_edge, -1):
-        ahead.append(current)
-    is_closed = current >= 0
-    if not is_closed:
-        current = half_edge
-        while (current := int(t.turn_back[current])) >= 0:
-            behind.append(current)
-    # From the most clockwise half-edge on.
-    around, vertex = behind[::-1] + ahead, int(t.face_vertices[half_edge])
-    sizes = t.face_sizes[t.face[around]].tolist()
-    fan = Fan(
-        tuple(sizes[len(behind) :]),
-        None if is_closed else tuple(sizes[: len(behind)][::-1]),
-        VertexRule(int(t.vertex_rules[vertex])),
-    )
-    if semi is None or not t.is_semi_sharp_vertex[vertex]:
-        return fan
-    across = []
-    if len(semi.across_vertex):
-        here = semi.across_vertex == vertex
-        columns = semi.across_sharpness[here], semi.across_refined[here], semi.across_sharpens[here]
-        across = sorted(zip(*(column.tolist() for column in columns), strict=True))
-    edges = tuple(map(tuple, t.edge_sharpness[around].tolist()))
-    return fan._replace(edges=edges, vertex=float(semi.vertices[vertex]), across=tuple(across))
+    ahead, behind, is_closed = [half_edges], list[IntArray](), np.zeros(len(half_edges), dtype=bool)
+    while (ahead[-1] >= 0).any():
+        current = np.where(ahead[-1] < 0, -1, t.turn[ahead[-1]])
+        is_closed |= current == half_edges
+        ahead.append(np.where(current == half_edges, -1, current))
+    current = np.where(is_closed, -1, half_edges)
+    while (current >= 0).any():
+        current = np.where(current < 0, -1, t.turn_back[current])
+        behind.append(current)
+    # From the most clockwise half-edge on, -1 for none.
+    around = np.stack([*behind[::-1], *ahead], axis=1)
+    is_face, vertices = around >= 0, t.face_vertices[half_edges]
+    sizes = np.split(t.face_sizes[t.face[around[is_face]]], np.cumsum(is_face.sum(axis=1))[:-1])
+    behind_counts = is_face[:, : len(behind)].sum(axis=1).tolist()
+    fans = [
+        Fan(tuple(row[count:].tolist()), None if closed else tuple(row[:count][::-1].tolist()), VertexRule(rule))
+        for row, count, closed, rule in zip(
+            sizes, behind_counts, is_closed.tolist(), t.vertex_rules[vertices].tolist(), strict=True
+        )
+    ]
+    if semi is None:
+        return fans
+    for index in np.flatnonzero(t.is_semi_sharp_vertex[vertices]).tolist():
+        across, vertex = [], vertices[index]
+        if len(semi.across_vertex):
+            here = semi.across_vertex == vertex
+            columns = semi.across_sharpness[here], semi.across_refined[here], semi.across_sharpens[here]
+            across = sorted(zip(*(column.tolist() for column in columns), strict=True))
+        edges = tuple(map(tuple, t.edge_sharpness[around[index][is_face[index]]].tolist()))
+        fans[index] = fans[index]._replace(edges=edges, vertex=float(semi.vertices[vertex]), across=tuple(across))
+    return fans
 
 
 def fan_codes(

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
-from ..mesh.one_ring import one_ring
+from ..mesh.one_ring import Surroundings, one_rings
 from ..mesh.shared import Content, Shared
-from ..mesh.signature import Signature, fan_codes, row_codes, signature_at
-from ..messages import counted
+from ..mesh.signature import Signature, fan_codes, row_codes, signatures_at
 from ..schemes.scheme import Scheme
 
 if TYPE_CHECKING:
@@ -103,13 +102,11 @@ class PatchTable:
     def _classes(self) -> tuple[tuple[PatchClass, ...], IndexArray]:
         order, bounds = self._order
         corners_of_class = np.split(self._patch_codes[0][order], bounds)
-        signatures = [
-            signature_at(self.topology, int(self.half_edge_of_corner[corners[0]]), self.scheme.element)
-            for corners in counted(corners_of_class, "Classes of patches")
-        ]
+        first_half_edges = self.half_edge_of_corner[[corners[0] for corners in corners_of_class]]
+        signatures = signatures_at(self.topology, first_half_edges, self.scheme.element, self._patch_codes[2])
         if self.scheme.has_local_borders:
             signatures = [signature.near() for signature in signatures]
-        rings = [one_ring(signature) for signature in signatures]
+        rings, surroundings = one_rings(signatures), Surroundings(self.topology)
         counts = [ring.vertex_count for ring in rings]
         entry_counts = [count * len(corners) for count, corners in zip(counts, corners_of_class, strict=True)]
         begins = ragged.offsets(entry_counts).tolist()
@@ -117,7 +114,7 @@ class PatchTable:
         classes = []
         for signature, ring, corners, begin in zip(signatures, rings, corners_of_class, begins[:-1], strict=True):
             columns = controls[begin : begin + ring.vertex_count * len(corners)].reshape(ring.vertex_count, -1)
-            class_controls = ring.gather(self.topology, self.half_edge_of_corner[corners], columns)
+            class_controls = ring.gather(surroundings, self.half_edge_of_corner[corners], columns)
             classes.append(PatchClass(signature, corners, class_controls, begin))
         return tuple(classes), controls
 
@@ -205,14 +202,13 @@ class PatchTable:
         return class_index, patch, patch_corner
 
     @cached_property
-    def _patch_codes(self) -> tuple[IndexArray, IntArray]:
-        """The corner at which each patch begins, and the patch's code, which is equal for equal signatures."""
-        t, fans = self.elements, fan_codes(self.topology, near=self.scheme.has_local_borders)
-        if t is not self.topology:
-            fans = fans[self.half_edge_of_corner]
+    def _patch_codes(self) -> tuple[IndexArray, IntArray, IntArray]:
+        """The corner at which each patch begins; its code, equal for equal signatures; and `fan_codes` of the mesh."""
+        t, of_mesh = self.elements, fan_codes(self.topology, near=self.scheme.has_local_borders)
+        fans = of_mesh if t is self.topology else of_mesh[self.half_edge_of_corner]
         begins, whole_codes = self._turned_to_least(fans, t.face_offsets[:-1][self.is_whole])
         if self.is_whole.all():
-            return begins, whole_codes
+            return begins, whole_codes, of_mesh
         corners: list[IntArray] = [begins]
         codes = [whole_codes]
         partial = t.half_edges_of(~self.is_whole)
@@ -226,7 +222,7 @@ class PatchTable:
                 corner = t.next[corner]
             first_unused = 1 + max(int(codes_of_size.max(initial=0)) for codes_of_size in codes)
             codes.append(row_codes(columns).astype(np.int64) + first_unused)
-        return np.concatenate(corners, dtype=np.int32), np.concatenate(codes)
+        return np.concatenate(corners, dtype=np.int32), np.concatenate(codes), of_mesh
 
     def _turned_to_least(
         self,
