@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import chain, pairwise
 
 import numpy as np
@@ -64,8 +65,7 @@ class OneRing:
     # The local mesh, which has a border. Half-edge 0 names the element; the vertices of the element come first.
     topology: Topology
     around: list[IntArray]  # Half-edges of the fan at each corner of the element, from the most clockwise one on
-    # (K - c,) int64 each, for the vertices after those at the c corners: a corner that has the vertex around it, and
-    # how far it comes after `Surroundings.start` of the corner
+    # (K,) int64: a corner that each vertex is around, and how far it comes after `Surroundings.start` of the corner
     corner: IntArray
     offset: IntArray
     # Local vertices (corner, first, last) for each corner of the element on a border; first and last are its
@@ -104,11 +104,81 @@ class OneRing:
             for _ in range(corner_count - 1):
                 corners.append(t.next.take(corners[-1]))
             t.face_vertices.take(corners, out=columns[:corner_count, part], mode="clip")
-            index = surroundings.start.take(corners).take(self.corner, axis=0) + self.offset[:, None]
+            starts = surroundings.start.take(corners)
+            index = starts.take(self.corner[corner_count:], axis=0) + self.offset[corner_count:, None]
             surroundings.vertices.take(index, out=columns[corner_count:, part], mode="clip")
-        for centre, first, last in self.open_fans:
-            columns[first], columns[last] = t.border_neighbours(columns[centre])
+        self.end_open_fans(t, columns)
         return columns.T
+
+    def end_open_fans(self, topology: Topology, columns: NDArray[np.int32]) -> None:
+        """Set the border neighbours of corners on a border, in vertices ``(K, e)`` of elements."""
+        for centre, first, last in self.open_fans:
+            columns[first], columns[last] = topology.border_neighbours(columns[centre])
+
+
+class RingTable:
+    """The one-rings of many elements in a mesh, grouped by signature. All are gathered at once, when first needed."""
+
+    def __init__(
+        self,
+        topology: Topology,
+        rings: list[OneRing],  # One-ring of each group
+        half_edges: IndexArray,  # (e,) int32: the half-edge that names each element, group by group
+        element_counts: IntArray,  # (g,) int: number of elements in each group
+    ) -> None:
+        self.topology, self.rings, self.half_edges = topology, rings, half_edges
+        self.vertex_counts = np.array([ring.vertex_count for ring in rings], dtype=np.int64)
+        # Indices of the first element of each group, and of its first entry in `vertices`.
+        self.first_element, self.offsets = (
+            ragged.offsets(element_counts),
+            ragged.offsets(self.vertex_counts * element_counts),
+        )
+
+    @cached_property
+    def _surroundings(self) -> Surroundings:
+        return Surroundings(self.topology)
+
+    @cached_property
+    def vertices(self) -> IndexArray:
+        """The vertices of all groups: for each local vertex, those of all elements."""
+        vertices = np.empty(self.offsets[-1], dtype=np.int32)
+        # Not kept for this: it is as large as the result.
+        surroundings = vars(self).get("_surroundings") or Surroundings(self.topology)
+        bounds = pairwise(self.first_element.tolist()), pairwise(self.offsets.tolist())
+        for ring, elements, entries in zip(self.rings, *bounds, strict=True):
+            columns = vertices[slice(*entries)].reshape(ring.vertex_count, -1)
+            ring.gather(surroundings, self.half_edges[slice(*elements)], columns)
+        return vertices
+
+    @cached_property
+    def _columns(self) -> tuple[IntArray, IntArray, IntArray]:
+        """Number of corners of each group's elements; `OneRing.corner` and `OneRing.offset` of all groups."""
+        return (
+            np.array([len(ring.around) for ring in self.rings]),
+            np.concatenate([ring.corner for ring in self.rings]),
+            np.concatenate([ring.offset for ring in self.rings]),
+        )
+
+    def vertices_of(
+        self,
+        group: IntArray,  # (s,) int64, in increasing order
+        element: IntArray,  # (s,) int64: index in the group
+    ) -> list[IndexArray]:
+        """Return the vertices ``(n, K)`` of some elements, for each group that has any of them."""
+        t, surroundings, (corner_counts, corner, offset) = self.topology, self._surroundings, self._columns
+        counts, corner_counts = self.vertex_counts[group], corner_counts[group]
+        corners = t.along_faces(self.half_edges[self.first_element[group] + element], corner_counts)
+        column = ragged.ranges(ragged.starts(self.vertex_counts)[group], counts)
+        at = corners[np.repeat(ragged.starts(corner_counts), counts) + corner[column]]
+        vertices = surroundings.vertices[surroundings.start[at] + offset[column]]
+        vertices[ragged.ranges(ragged.starts(counts), corner_counts)] = t.face_vertices[corners]
+        in_groups, end = [], 0
+        element_counts = np.bincount(group)
+        for index in np.flatnonzero(element_counts).tolist():
+            ring, begin, end = self.rings[index], end, end + int(element_counts[index] * self.vertex_counts[index])
+            in_groups.append(vertices[begin:end].reshape(-1, ring.vertex_count))
+            ring.end_open_fans(t, in_groups[-1].T)
+        return in_groups
 
 
 def one_ring(signature: Signature) -> OneRing:
@@ -210,17 +280,16 @@ def _glued_rings(signatures: Sequence[Signature]) -> list[OneRing]:
     spans = (pairwise(offsets.tolist()) for offsets in (faces, half_edges, vertices))
     rings = []
     for signature, fan, of_faces, of_edges, of_vertices in zip(signatures, first_fan.tolist(), *spans, strict=True):
-        corners, slots = range(len(signature.fans)), slice(*of_edges)
+        corners, edges, slots = range(len(signature.fans)), slice(*of_edges), slice(*of_vertices)
         topology = Topology(
             of_vertices[1] - of_vertices[0],
             glued.face_sizes[slice(*of_faces)],
-            local_vertex[slots],
-            names[slots],
-            rules[slice(*of_vertices)],
+            local_vertex[edges],
+            names[edges],
+            rules[slots],
         )
-        others = slice(of_vertices[0] + len(corners), of_vertices[1])
         open_fans = [(corner, *ends[fan + corner]) for corner in corners if not signature.fans[corner].is_closed]
-        rings.append(OneRing(topology, around[fan : fan + len(corners)], corner[others], offset[others], open_fans))
+        rings.append(OneRing(topology, around[fan : fan + len(corners)], corner[slots], offset[slots], open_fans))
     return rings
 
 

@@ -71,11 +71,9 @@ class PatchSampler:
         """Evaluate points, derivatives and normals at samples."""
         class_index, patch, corner = self.patches.patch_at(half_edge)
         samples = SurfaceSamples.empty(len(uv), self.control_values.shape[1], dtype, derivatives)
-        for run, located, classes in located_runs(self.patches, class_index, corner, uv):
-            points = [
-                self._values.take(patch_class.controls.take(patch[run[of_class]], axis=0), axis=0)
-                for patch_class, of_class in zip(classes, located.slices(), strict=True)
-            ]
+        for run, located, _ in located_runs(self.patches, class_index, corner, uv):
+            controls = self.patches.rings.vertices_of(class_index[run], patch[run])
+            points = [self._values.take(class_controls, axis=0) for class_controls in controls]
             of_run = evaluate_samples(located, points, self._extent, evaluator, dtype, derivatives)
             for values, run_values in zip(samples, of_run, strict=True):
                 if values is not None and run_values is not None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
-from ..mesh.one_ring import Surroundings, one_rings
+from ..mesh.one_ring import RingTable, one_rings
 from ..mesh.shared import Content, Shared
 from ..mesh.signature import Signature, fan_codes, row_codes, signatures_at
 from ..schemes.scheme import Scheme
@@ -41,9 +41,16 @@ class PatchClass:
     signature: Signature
     # (p,) int32: the corner of the element at which each patch begins, a half-edge of `PatchTable.elements`
     corners: IndexArray
-    controls: IndexArray  # (p, K) int32: 0-based mesh vertices of each patch's one-ring
+    control_count: int  # K
     # Index of the first entry of `controls` in `PatchTable.controls`, where the rest follows, column by column
     first_control: int
+    rings: RingTable
+
+    @property
+    def controls(self) -> IndexArray:
+        """``(p, K)`` 0-based mesh vertices of each patch's one-ring."""
+        end = self.first_control + self.control_count * len(self.corners)
+        return self.rings.vertices[self.first_control : end].reshape(self.control_count, -1).T
 
 
 class PatchTable:
@@ -83,40 +90,36 @@ class PatchTable:
         """``(n_e,)`` whether each element is a single patch: it has as many corners as the scheme's domain."""
         return self.elements.face_sizes == self.scheme.domain.corner_count
 
-    @property
+    @cached_property
     def classes(self) -> tuple[PatchClass, ...]:
         """The classes of all patches, in the order of their codes."""
-        return self._classes[0]
+        rings, corners = self.rings, np.split(self._patch_codes[0][self._order[0]], self._order[1])
+        columns = self._signatures, corners, rings.vertex_counts.tolist(), rings.offsets[:-1].tolist()
+        return tuple(PatchClass(*row, rings) for row in zip(*columns, strict=True))
 
     @property
     def controls(self) -> IndexArray:
         """`PatchClass.controls` of all classes, flat."""
-        return self._classes[1]
+        return self.rings.vertices
 
-    @cached_property
+    @property
     def control_counts(self) -> IntArray:
         """``(c,)`` K, the number of control points of a patch, of each class."""
-        return np.array([patch_class.controls.shape[1] for patch_class in self.classes], dtype=np.int64)
+        return self.rings.vertex_counts
 
     @cached_property
-    def _classes(self) -> tuple[tuple[PatchClass, ...], IndexArray]:
+    def _signatures(self) -> list[Signature]:
+        first = self._patch_codes[0][self._order[0][[0, *self._order[1]]]]
+        half_edges = self.half_edge_of_corner[first]
+        signatures = signatures_at(self.topology, half_edges, self.scheme.element, self._patch_codes[2])
+        return [signature.near() for signature in signatures] if self.scheme.has_local_borders else signatures
+
+    @cached_property
+    def rings(self) -> RingTable:
+        """The one-rings of all patches, class by class."""
         order, bounds = self._order
-        corners_of_class = np.split(self._patch_codes[0][order], bounds)
-        first_half_edges = self.half_edge_of_corner[[corners[0] for corners in corners_of_class]]
-        signatures = signatures_at(self.topology, first_half_edges, self.scheme.element, self._patch_codes[2])
-        if self.scheme.has_local_borders:
-            signatures = [signature.near() for signature in signatures]
-        rings, surroundings = one_rings(signatures), Surroundings(self.topology)
-        counts = [ring.vertex_count for ring in rings]
-        entry_counts = [count * len(corners) for count, corners in zip(counts, corners_of_class, strict=True)]
-        begins = ragged.offsets(entry_counts).tolist()
-        controls = np.empty(begins[-1], dtype=np.int32)
-        classes = []
-        for signature, ring, corners, begin in zip(signatures, rings, corners_of_class, begins[:-1], strict=True):
-            columns = controls[begin : begin + ring.vertex_count * len(corners)].reshape(ring.vertex_count, -1)
-            class_controls = ring.gather(surroundings, self.half_edge_of_corner[corners], columns)
-            classes.append(PatchClass(signature, corners, class_controls, begin))
-        return tuple(classes), controls
+        half_edges = self.half_edge_of_corner[self._patch_codes[0][order]]
+        return RingTable(self.topology, one_rings(self._signatures), half_edges, np.diff([0, *bounds, len(order)]))
 
     def forget(self) -> None:
         """Drop what is computed again on demand, for a mesh that nothing is evaluated on but kernels made of it."""
@@ -190,15 +193,17 @@ class PatchTable:
     @cached_property
     def _patch_of_corner(self) -> tuple[IntArray, IndexArray, NDArray[np.int8]]:
         """`patch_at` for all half-edges, in small integer types, as a cage may have millions of them."""
-        t = self.elements
+        t, (order, bounds) = self.elements, self._order
         dtypes = np.min_scalar_type(-self.class_count), np.int32, np.int8
         class_index, patch, patch_corner = (np.full(t.half_edge_count, -1, dtype=dtype) for dtype in dtypes)
-        for index, patch_class in enumerate(self.classes):
-            corners = patch_class.corners
-            is_whole = self.is_whole[t.face[corners[0]]]
-            for turn in range(self.scheme.domain.corner_count if is_whole else 1):
-                class_index[corners], patch[corners], patch_corner[corners] = index, np.arange(len(corners)), turn
-                corners = t.next[corners]
+        corners, counts = self._patch_codes[0][order], np.diff([0, *bounds, len(order)])
+        in_class, index = np.repeat(np.arange(len(counts)), counts), ragged.index_in_row(counts)
+        for turn in range(self.scheme.domain.corner_count):
+            class_index[corners], patch[corners], patch_corner[corners] = in_class, index, turn
+            if turn == 0:
+                is_whole = self.is_whole[t.face[corners]]
+                corners, in_class, index = corners[is_whole], in_class[is_whole], index[is_whole]
+            corners = t.next[corners]
         return class_index, patch, patch_corner
 
     @cached_property
