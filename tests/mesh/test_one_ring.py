@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision.mesh import ragged
-from mitsuba_subdivision.mesh.one_ring import Surroundings, one_ring
+from mitsuba_subdivision.mesh.one_ring import RingTable, one_ring
 from mitsuba_subdivision.mesh.signature import Fan, Signature, signature_at
 from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, polygons, torus
 from reference.exact_samples import mesh_of
@@ -26,6 +26,15 @@ def by_name(topologies):
 
 WITH_SHEETS = TOPOLOGIES | {"sheet": sheet(3, 2).topology, "triangle sheet": sheet(3, 2, triangles=True).topology}
 EVERY_KIND = pytest.mark.parametrize("kind", ["face", "vertex"])
+
+
+def gathered(ring, topology, half_edges):
+    """All at once, as some of them are."""
+    table = RingTable(topology, [ring], np.array(half_edges), np.array([len(half_edges)]))
+    index = np.arange(len(half_edges))
+    (some,) = table.vertices_of(0 * index, index)
+    np.testing.assert_array_equal(table.vertices.reshape(-1, len(half_edges)).T, some)
+    return some
 
 
 def element_vertices(topology, half_edge, kind):
@@ -62,7 +71,7 @@ def test_gathered_ring_is_a_map_of_meshes(topology, kind):
         faces |= {face[i:] + face[:i]: index for i in range(len(face))}
     for half_edge in half_edges_of(topology):
         ring = one_ring(signature_at(topology, half_edge, kind))
-        controls = ring.gather(Surroundings(topology), np.array([half_edge]))[0]
+        controls = gathered(ring, topology, [half_edge])[0]
         local = ring.topology
         element = element_vertices(topology, half_edge, kind)
         assert tuple(controls[: len(element)]) == element
@@ -85,9 +94,9 @@ def test_many_elements_gather_as_each_alone(topology, kind, monkeypatch):
         classes.setdefault(signature_at(topology, half_edge, kind), []).append(half_edge)
     for signature, members in classes.items():
         ring = one_ring(signature)
-        alone = [ring.gather(Surroundings(topology), np.array([member]))[0] for member in members]
+        alone = [gathered(ring, topology, [member])[0] for member in members]
         assert alone[0].shape == (ring.vertex_count,)
-        np.testing.assert_array_equal(ring.gather(Surroundings(topology), np.array(members)), alone)
+        np.testing.assert_array_equal(gathered(ring, topology, members), alone)
 
 
 @pytest.mark.parametrize("sharpness", [9.99, 10.0, 20.0])
@@ -102,7 +111,7 @@ def test_corners_of_sharpness_ten_are_not_semi_sharp(sharpness):
 def test_faces_that_meet_at_a_vertex_of_valence_2_are_joined_along_both_edges():
     topology = cube_with_valence_2().topology
     ring = one_ring(signature_at(topology, 0, "face"))
-    controls = ring.gather(Surroundings(topology), np.array([0]))[0]
+    controls = gathered(ring, topology, [0])[0]
     assert ring.topology.face_vertices[3] == 3
     assert controls[3] == 8
     assert ring.topology.vertex_face_count[3] == 2

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.mesh.one_ring import Surroundings, one_ring
+from mitsuba_subdivision.mesh.one_ring import RingTable, one_ring
 from mitsuba_subdivision.mesh.signature import FEW_CODES, NEAR_FACES, row_codes, signature_at
 from mitsuba_subdivision.patches.patch_table import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
@@ -45,7 +45,8 @@ def test_patches_of_a_class_have_its_signature_and_one_ring_and_others_have_not(
         assert patch_class.controls.shape == (len(patch_class.corners), ring.vertex_count)
         half_edges = table.half_edge_of_corner[patch_class.corners]
         for controls, half_edge in zip(patch_class.controls, half_edges, strict=True):
-            np.testing.assert_array_equal(controls, ring.gather(Surroundings(table.topology), np.array([half_edge]))[0])
+            alone = RingTable(table.topology, [ring], np.array([half_edge]), np.array([1]))
+            np.testing.assert_array_equal(controls, alone.vertices)
             assert controls[0] == table.topology.face_vertices[half_edge]
     assert_classes_differ(table)
 

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import ragged
-from ..mesh.connectivity import INFINITE, IndexArray, IntArray, VertexRule
-from ..mesh.one_ring import OneRing, Surroundings, joined_rings, one_ring, one_rings
+from ..mesh.connectivity import INFINITE, IntArray, VertexRule
+from ..mesh.one_ring import RingTable, joined_rings, one_ring, one_rings
 from ..mesh.signature import Fan, Signature, signatures_at
 from ..schemes.domain import IDENTITY, FloatArray, ParameterMap
 from ..schemes.scheme import Scheme, SchemeError
@@ -150,14 +150,15 @@ class PatchTree:
     def _below(self) -> IntArray:
         """`nodes` without the root."""
         children = [child for child, _ in self.children]
-        rows, below = [np.empty((0, 3), dtype=np.int64)], []
-        # For each `PartKind` the next index: of a node for inner nodes, of a piece for regular pieces and tips.
-        first = np.array([len(children), len(children), 0, 0])
-        for child in children:
-            rows.append(np.array([[child.kind, child.turn, first[child.kind]]]))
-            below.append(child._below + first[child._below[:, :1]] * np.array([0, 0, 1]))
-            first += [len(child._below)] * 2 + [child.regular_count, child.tip_count]
-        return np.concatenate(rows + below)
+        if not children:
+            return np.empty((0, 3), dtype=np.int64)
+        # For each child and `PartKind` the first index: of a node for inner nodes, of a piece for regular pieces, tips.
+        sizes = np.array([[len(child._below)] * 2 + [child.regular_count, child.tip_count] for child in children])
+        first = np.cumsum(sizes, axis=0) - sizes + [len(children), len(children), 0, 0]
+        rows = [(child.kind, child.turn, row[child.kind]) for child, row in zip(children, first.tolist(), strict=True)]
+        below = np.concatenate([child._below for child in children])
+        below[:, 2] += first[np.repeat(np.arange(len(children)), sizes[:, 0]), below[:, 0]]
+        return np.concatenate([rows, below])
 
     def coefficients(
         self,
@@ -256,21 +257,13 @@ def refined_children(scheme: Scheme, signatures: Sequence[Signature]) -> list[li
     ]
     half_edges = np.array([half_edge for *_, half_edge in parts])
     of_parts = signatures_at(refined, half_edges, scheme.element)
-    # Control points of children of equal connectivity are gathered at once.
-    alike: dict[OneRing, list[int]] = {}
-    for index, ring in enumerate(one_rings(of_parts)):
-        alike.setdefault(ring, []).append(index)
-    controls: dict[int, IndexArray] = {}
-    surroundings = Surroundings(refined)
-    for ring, indices in alike.items():
-        controls |= zip(indices, ring.gather(surroundings, half_edges[indices]), strict=True)
-
+    # A group for each child, of one element
+    rings, groups = RingTable(refined, one_rings(of_parts), half_edges, np.ones(len(parts), int)), np.arange(len(parts))
     # A row for each control point of each child, as long as the one-ring of the parent has vertices.
-    of_children = [controls[index] for index in range(len(parts))]
-    row_counts = [len(of_child) for of_child in of_children]
+    row_counts, controls = rings.vertex_counts, np.concatenate(rings.vertices_of(groups, 0 * groups), axis=None)
     parent_of_row = np.repeat([parent for parent, *_ in parts], row_counts)
     offsets = ragged.offsets(np.diff(first_vertices)[parent_of_row])
-    rows, columns, weights = table.entries(np.concatenate(of_children))
+    rows, columns, weights = table.entries(controls)
     error = np.abs(np.bincount(rows, weights, minlength=len(parent_of_row)) - 1)
     # `not <=` also refuses NaN.
     if not error.max() <= ROW_SUM:
@@ -284,7 +277,7 @@ def refined_children(scheme: Scheme, signatures: Sequence[Signature]) -> list[li
     flat: FloatArray = np.bincount(places, weights, minlength=offsets[-1]).astype(np.float64, copy=False)
     blocks = np.split(flat, offsets[np.cumsum(row_counts)[:-1]])
     children: list[list[Child]] = [[] for _ in signatures]
-    for (parent, domain, _), signature, count, block in zip(parts, of_parts, row_counts, blocks, strict=True):
+    for (parent, domain, _), signature, count, block in zip(parts, of_parts, row_counts.tolist(), blocks, strict=True):
         children[parent].append(Child(domain, signature, block.reshape(count, -1)))
     return children
 
@@ -358,7 +351,9 @@ def rotation_order(signature: Signature, corner: int) -> NDArray[np.int64]:
     half_edge = 0
     for _ in range(corner):
         half_edge = int(ring.topology.next[half_edge] if signature.kind == "face" else ring.topology.turn[half_edge])
-    return one_ring(signature.rotated(corner)).gather(Surroundings(ring.topology), np.array([half_edge]))[0]
+    return RingTable(
+        ring.topology, [one_ring(signature.rotated(corner))], np.array([half_edge]), np.array([1])
+    ).vertices
 
 
 @lru_cache(maxsize=1024)

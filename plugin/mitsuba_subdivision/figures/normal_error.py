@@ -20,7 +20,7 @@ from .. import example_file
 from ..cage import ControlCage
 from ..cage.named_cages import extraordinary
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
-from ..mesh.one_ring import Surroundings, one_ring
+from ..mesh.one_ring import RingTable, one_ring
 from ..regression.tiers import normal_angle
 from ..schemes import scheme_named
 from ..schemes.domain import FloatArray
@@ -214,7 +214,7 @@ def exact_normals(cage: ControlCage) -> NDArray[np.float64]:
     scheme = scheme_named("catmull_clark")
     patch = patch_of_valence(scheme, int(cage.topology.vertex_face_count[0]))
     # Vertex 0 is the first corner of face 0.
-    controls = one_ring(patch.signature).gather(Surroundings(cage.topology), np.array([0]))[0]
+    controls = RingTable(cage.topology, [one_ring(patch.signature)], np.array([0]), np.array([1])).vertices
     with localcontext() as context:
         context.prec = DIGITS
         matrix, *children = (_exactly(table, 1) for table in (patch.matrix, *patch.children))

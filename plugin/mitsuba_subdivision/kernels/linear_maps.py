@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
+from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -165,7 +166,8 @@ class WeightBlocks:
         self._row_size = -(-self.width // PACKET) * PACKET
         rows = np.zeros((sum(len(part) * part.shape[2] for part in weights), self._row_size), types.numpy_float)
         end = 0
-        for part in weights:
+        for _, parts in groupby(weights, lambda part: part.shape[2]):
+            part = np.concatenate([*parts])
             begin, end = end, end + len(part) * part.shape[2]
             block_rows = rows[begin:end].reshape(len(part), part.shape[2], -1)[:, :, : self.width]
             block_rows[:] = part.swapaxes(1, 2)

@@ -43,7 +43,7 @@ class Surroundings:
                 fans.append(t.turn.take(fans[-1]))
             ordered.append(np.stack(fans if kind % 2 else 2 * fans, axis=1).ravel())
         half_edge = np.concatenate(ordered)
-        counts = (np.full_like(half_edge, t.common_size) if t.common_size else t.face_sizes[t.face[half_edge]]) - 2
+        counts = np.broadcast_to((t.common_size or t.face_sizes[t.face[half_edge]]) - 2, len(half_edge))
         begins = ragged.starts(counts)
         # (n_h,) int32: index in `vertices` at which the half-edge's face begins, around the half-edge's first vertex.
         # Assigned backwards, as the last assignment is kept.
@@ -55,7 +55,8 @@ class Surroundings:
                 is_long = counts > step
                 half_edge, counts, begins = half_edge[is_long], counts[is_long], begins[is_long]
             half_edge = t.next.take(half_edge)
-            self.vertices[begins + step] = t.face_vertices.take(half_edge)
+            places = slice(step, None, t.common_size - 2) if t.common_size else begins + step
+            self.vertices[places] = t.face_vertices.take(half_edge)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,40 +85,14 @@ class OneRing:
         is_closed = int(t.turn[half_edges[-1]]) >= 0
         return neighbours if is_closed else [int(t.face_vertices[t.next[half_edges[0]]]), *neighbours]
 
-    def gather(
-        self,
-        surroundings: Surroundings,
-        half_edges: IndexArray,  # (e,) int32: the half-edge that names each element
-        # (K, e) int32: output array; the result is a transposed view of it
-        columns: NDArray[np.int32] | None = None,
-    ) -> NDArray[np.int32]:
-        """Find the vertices of a mesh in the one-rings of many elements of this signature.
-
-        Returns (e, K) int32.
-        """
-        # Often the largest array of all. It is filled by local vertices, so these are along the first axis.
-        if columns is None:
-            columns = np.empty((self.vertex_count, len(half_edges)), dtype=np.int32)
-        t, corner_count = surroundings.topology, len(self.around)
-        for part in ragged.chunks_of(len(half_edges), 8):
-            corners = [half_edges[part]]
-            for _ in range(corner_count - 1):
-                corners.append(t.next.take(corners[-1]))
-            t.face_vertices.take(corners, out=columns[:corner_count, part], mode="clip")
-            starts = surroundings.start.take(corners)
-            index = starts.take(self.corner[corner_count:], axis=0) + self.offset[corner_count:, None]
-            surroundings.vertices.take(index, out=columns[corner_count:, part], mode="clip")
-        self.end_open_fans(t, columns)
-        return columns.T
-
     def end_open_fans(self, topology: Topology, columns: NDArray[np.int32]) -> None:
-        """Set the border neighbours of corners on a border, in vertices ``(K, e)`` of elements."""
+        """Set the border neighbours of corners, in the vertices ``(K, e)`` of elements of a mesh."""
         for centre, first, last in self.open_fans:
             columns[first], columns[last] = topology.border_neighbours(columns[centre])
 
 
 class RingTable:
-    """The one-rings of many elements in a mesh, grouped by signature. All are gathered at once, when first needed."""
+    """The vertices of a mesh in the one-rings of many elements, grouped by signature."""
 
     def __init__(
         self,
@@ -127,12 +102,11 @@ class RingTable:
         element_counts: IntArray,  # (g,) int: number of elements in each group
     ) -> None:
         self.topology, self.rings, self.half_edges = topology, rings, half_edges
+        # (g,) int64: K, the number of control points
         self.vertex_counts = np.array([ring.vertex_count for ring in rings], dtype=np.int64)
-        # Indices of the first element of each group, and of its first entry in `vertices`.
-        self.first_element, self.offsets = (
-            ragged.offsets(element_counts),
-            ragged.offsets(self.vertex_counts * element_counts),
-        )
+        # (g + 1,) int64: index in `vertices` of the first entry of each group
+        self.offsets = ragged.offsets(self.vertex_counts * element_counts)
+        self._first_element = ragged.offsets(element_counts)
 
     @cached_property
     def _surroundings(self) -> Surroundings:
@@ -140,24 +114,35 @@ class RingTable:
 
     @cached_property
     def vertices(self) -> IndexArray:
-        """The vertices of all groups: for each local vertex, those of all elements."""
-        vertices = np.empty(self.offsets[-1], dtype=np.int32)
-        # Not kept for this: it is as large as the result.
-        surroundings = vars(self).get("_surroundings") or Surroundings(self.topology)
-        bounds = pairwise(self.first_element.tolist()), pairwise(self.offsets.tolist())
+        """The vertices of all groups, flat: for each local vertex of a group, those of all its elements."""
+        # Often the largest array of all. The surroundings are half as large, and are not kept for it.
+        vertices, t = np.empty(self.offsets[-1], dtype=np.int32), self.topology
+        surroundings = vars(self).get("_surroundings") or Surroundings(t)
+        bounds = pairwise(self._first_element.tolist()), pairwise(self.offsets.tolist())
         for ring, elements, entries in zip(self.rings, *bounds, strict=True):
-            columns = vertices[slice(*entries)].reshape(ring.vertex_count, -1)
-            ring.gather(surroundings, self.half_edges[slice(*elements)], columns)
+            columns, half_edges = (
+                vertices[slice(*entries)].reshape(ring.vertex_count, -1),
+                self.half_edges[slice(*elements)],
+            )
+            count = len(ring.around)
+            for part in ragged.chunks_of(len(half_edges), 8):
+                corners = [half_edges[part]]
+                for _ in range(count - 1):
+                    corners.append(t.next.take(corners[-1]))
+                t.face_vertices.take(corners, out=columns[:count, part], mode="clip")
+                starts = surroundings.start.take(corners)
+                index = starts.take(ring.corner[count:], axis=0) + ring.offset[count:, None]
+                surroundings.vertices.take(index, out=columns[count:, part], mode="clip")
+            ring.end_open_fans(t, columns)
         return vertices
 
     @cached_property
-    def _columns(self) -> tuple[IntArray, IntArray, IntArray]:
+    def _places(self) -> tuple[IntArray, IntArray, IntArray]:
         """Number of corners of each group's elements; `OneRing.corner` and `OneRing.offset` of all groups."""
-        return (
-            np.array([len(ring.around) for ring in self.rings]),
-            np.concatenate([ring.corner for ring in self.rings]),
-            np.concatenate([ring.offset for ring in self.rings]),
-        )
+        corner_counts = np.array([len(ring.around) for ring in self.rings])
+        columns = zip(*((ring.corner, ring.offset) for ring in self.rings), strict=True)
+        corner, offset = (np.concatenate(column) for column in columns)
+        return corner_counts, corner, offset
 
     def vertices_of(
         self,
@@ -165,20 +150,22 @@ class RingTable:
         element: IntArray,  # (s,) int64: index in the group
     ) -> list[IndexArray]:
         """Return the vertices ``(n, K)`` of some elements, for each group that has any of them."""
-        t, surroundings, (corner_counts, corner, offset) = self.topology, self._surroundings, self._columns
+        t, surroundings, (corner_counts, corner, offset) = self.topology, self._surroundings, self._places
         counts, corner_counts = self.vertex_counts[group], corner_counts[group]
-        corners = t.along_faces(self.half_edges[self.first_element[group] + element], corner_counts)
-        column = ragged.ranges(ragged.starts(self.vertex_counts)[group], counts)
-        at = corners[np.repeat(ragged.starts(corner_counts), counts) + corner[column]]
-        vertices = surroundings.vertices[surroundings.start[at] + offset[column]]
+        corners = t.along_faces(self.half_edges[self._first_element[group] + element], corner_counts)
+        place = ragged.ranges(ragged.starts(self.vertex_counts)[group], counts)
+        at = corners[np.repeat(ragged.starts(corner_counts), counts) + corner[place]]
+        vertices = surroundings.vertices[surroundings.start[at] + offset[place]]
         vertices[ragged.ranges(ragged.starts(counts), corner_counts)] = t.face_vertices[corners]
-        in_groups, end = [], 0
-        element_counts = np.bincount(group)
-        for index in np.flatnonzero(element_counts).tolist():
-            ring, begin, end = self.rings[index], end, end + int(element_counts[index] * self.vertex_counts[index])
-            in_groups.append(vertices[begin:end].reshape(-1, ring.vertex_count))
-            ring.end_open_fans(t, in_groups[-1].T)
-        return in_groups
+        sizes = np.bincount(group)
+        groups = np.flatnonzero(sizes)
+        bounds = pairwise(ragged.offsets(sizes[groups] * self.vertex_counts[groups]).tolist())
+        of_groups = [
+            vertices[slice(*span)].reshape(size, -1) for size, span in zip(sizes[groups].tolist(), bounds, strict=True)
+        ]
+        for index, of_group in zip(groups.tolist(), of_groups, strict=True):
+            self.rings[index].end_open_fans(t, of_group.T)
+        return of_groups
 
 
 def one_ring(signature: Signature) -> OneRing:

@@ -346,5 +346,9 @@ def _codes_around(
 
 
 def _value_codes(values: NDArray[np.float64]) -> IntArray:
-    """Number distinct values in ascending order."""
-    return np.unique(values, return_inverse=True)[1].ravel()
+    """Number distinct values ``>= 0`` in ascending order."""
+    codes = np.zeros(len(values), dtype=np.int64)
+    # Most are zero, and sorting takes long.
+    positive = np.flatnonzero(values)
+    codes[positive] = 1 + np.unique(values[positive], return_inverse=True)[1]
+    return codes

@@ -17,11 +17,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..evaluation.equations import times_matrix
 from ..evaluation.irregular_patch import LEVEL_PIECES, PIECE_LEVELS, IrregularPatch, float32_levels, level_polynomials
 from ..evaluation.patch_tree import PartKind, PatchTree, patch_trees
 from ..evaluation.polynomials import polynomial_basis
@@ -309,11 +311,23 @@ def _shared_parts(element: PatchTree) -> list[tuple[PatchTree, FloatArray | None
     """Return the largest parts with at most `SHARED_PIECES` pieces, and their stencils; None for the whole element."""
     if element.piece is not None or element.regular_count <= SHARED_PIECES:
         return [(element, None)]
-    return [
-        (part, child_stencils if stencils is None else stencils @ child_stencils)
-        for child, child_stencils in element.children
-        for part, stencils in _shared_parts(child)
-    ]
+    parts, rows = _stacked_parts(element)
+    bounds = pairwise(ragged.offsets([part.control_count for part in parts]).tolist())
+    return [(part, rows[slice(*span)]) for part, span in zip(parts, bounds, strict=True)]
+
+
+def _stacked_parts(element: PatchTree) -> tuple[list[PatchTree], FloatArray]:
+    """Return `_shared_parts` of an element that is divided, with all stencils in one array."""
+    parts, rows = list[PatchTree](), []
+    for child, stencils in element.children:
+        if child.piece is not None or child.regular_count <= SHARED_PIECES:
+            parts.append(child)
+            rows.append(stencils)
+        else:
+            of_child, of_parts = _stacked_parts(child)
+            parts += of_child
+            rows.append(times_matrix(of_parts[None], stencils)[0])
+    return parts, np.concatenate(rows)
 
 
 @lru_cache(maxsize=1024)
