@@ -20,7 +20,6 @@ from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.connectivity import INFINITE, IntArray, VertexRule
@@ -343,7 +342,7 @@ def _regular_fan(scheme: Scheme) -> Fan:
 
 
 @lru_cache(maxsize=4096)
-def rotation_order(signature: Signature, corner: int) -> NDArray[np.int64]:
+def rotation_order(signature: Signature, corner: int) -> IntArray:
     """Return indices of an element's control points in the order of ``signature.rotated(corner)``."""
     ring = one_ring(signature)
     if corner == 0:
@@ -351,9 +350,8 @@ def rotation_order(signature: Signature, corner: int) -> NDArray[np.int64]:
     half_edge = 0
     for _ in range(corner):
         half_edge = int(ring.topology.next[half_edge] if signature.kind == "face" else ring.topology.turn[half_edge])
-    return RingTable(
-        ring.topology, [one_ring(signature.rotated(corner))], np.array([half_edge]), np.array([1])
-    ).vertices
+    rotated = one_ring(signature.rotated(corner))
+    return RingTable(ring.topology, [rotated], np.array([half_edge]), np.array([1])).vertices
 
 
 @lru_cache(maxsize=1024)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from . import ragged
 from .connectivity import IndexArray, IntArray, SemiSharpness, Topology
+from .manifold import fan_labels
 from .signature import Fan, Signature
 
 # Number of one-rings that are kept for later calls.
@@ -29,12 +30,12 @@ _RINGS: dict[Signature, OneRing] = {}
 class Surroundings:
     """The vertices around each vertex of a mesh, face by face counter-clockwise, in one array.
 
-    Each face has those after its next vertex's half-edge up to, but without, its previous vertex, which is the first of
-    the following face. Around inner vertices all are listed twice, so that they go all around from any face.
+    The last vertex of each face is left out: it is the first one of the following face. Around an inner vertex the
+    faces come twice, so that all of them follow any of the first ones.
     """
 
     def __init__(self, topology: Topology) -> None:
-        self.topology = t = topology
+        t = topology
         is_open, ordered = t.open_fan_start >= 0, list[IntArray]()
         first, kinds = np.where(is_open, t.open_fan_start, t.vertex_half_edge), 2 * t.vertex_face_count + is_open
         for kind in np.flatnonzero(np.bincount(kinds)[2:]).tolist():
@@ -107,6 +108,9 @@ class RingTable:
         # (g + 1,) int64: index in `vertices` of the first entry of each group
         self.offsets = ragged.offsets(self.vertex_counts * element_counts)
         self._first_element = ragged.offsets(element_counts)
+        self._corner_counts = np.array([len(ring.around) for ring in rings])
+        self._corner = np.concatenate([ring.corner for ring in rings])
+        self._offset = np.concatenate([ring.offset for ring in rings])
 
     @cached_property
     def _surroundings(self) -> Surroundings:
@@ -116,15 +120,12 @@ class RingTable:
     def vertices(self) -> IndexArray:
         """The vertices of all groups, flat: for each local vertex of a group, those of all its elements."""
         # Often the largest array of all. The surroundings are half as large, and are not kept for it.
-        vertices, t = np.empty(self.offsets[-1], dtype=np.int32), self.topology
+        t, vertices = self.topology, np.empty(self.offsets[-1], dtype=np.int32)
         surroundings = vars(self).get("_surroundings") or Surroundings(t)
         bounds = pairwise(self._first_element.tolist()), pairwise(self.offsets.tolist())
         for ring, elements, entries in zip(self.rings, *bounds, strict=True):
-            columns, half_edges = (
-                vertices[slice(*entries)].reshape(ring.vertex_count, -1),
-                self.half_edges[slice(*elements)],
-            )
-            count = len(ring.around)
+            columns = vertices[slice(*entries)].reshape(ring.vertex_count, -1)
+            half_edges, count = self.half_edges[slice(*elements)], len(ring.around)
             for part in ragged.chunks_of(len(half_edges), 8):
                 corners = [half_edges[part]]
                 for _ in range(count - 1):
@@ -136,35 +137,25 @@ class RingTable:
             ring.end_open_fans(t, columns)
         return vertices
 
-    @cached_property
-    def _places(self) -> tuple[IntArray, IntArray, IntArray]:
-        """Number of corners of each group's elements; `OneRing.corner` and `OneRing.offset` of all groups."""
-        corner_counts = np.array([len(ring.around) for ring in self.rings])
-        columns = zip(*((ring.corner, ring.offset) for ring in self.rings), strict=True)
-        corner, offset = (np.concatenate(column) for column in columns)
-        return corner_counts, corner, offset
-
     def vertices_of(
         self,
         group: IntArray,  # (s,) int64, in increasing order
         element: IntArray,  # (s,) int64: index in the group
     ) -> list[IndexArray]:
         """Return the vertices ``(n, K)`` of some elements, for each group that has any of them."""
-        t, surroundings, (corner_counts, corner, offset) = self.topology, self._surroundings, self._places
-        counts, corner_counts = self.vertex_counts[group], corner_counts[group]
+        t, surroundings = self.topology, self._surroundings
+        counts, corner_counts = self.vertex_counts[group], self._corner_counts[group]
         corners = t.along_faces(self.half_edges[self._first_element[group] + element], corner_counts)
         place = ragged.ranges(ragged.starts(self.vertex_counts)[group], counts)
-        at = corners[np.repeat(ragged.starts(corner_counts), counts) + corner[place]]
-        vertices = surroundings.vertices[surroundings.start[at] + offset[place]]
+        at = corners[np.repeat(ragged.starts(corner_counts), counts) + self._corner[place]]
+        vertices = surroundings.vertices[surroundings.start[at] + self._offset[place]]
         vertices[ragged.ranges(ragged.starts(counts), corner_counts)] = t.face_vertices[corners]
         sizes = np.bincount(group)
         groups = np.flatnonzero(sizes)
-        bounds = pairwise(ragged.offsets(sizes[groups] * self.vertex_counts[groups]).tolist())
-        of_groups = [
-            vertices[slice(*span)].reshape(size, -1) for size, span in zip(sizes[groups].tolist(), bounds, strict=True)
-        ]
-        for index, of_group in zip(groups.tolist(), of_groups, strict=True):
-            self.rings[index].end_open_fans(t, of_group.T)
+        bounds, of_groups = pairwise(ragged.offsets(sizes[groups] * self.vertex_counts[groups]).tolist()), []
+        for index, span in zip(groups.tolist(), bounds, strict=True):
+            of_groups.append(vertices[slice(*span)].reshape(-1, self.rings[index].vertex_count))
+            self.rings[index].end_open_fans(t, of_groups[-1].T)
         return of_groups
 
 
@@ -237,14 +228,9 @@ def _glued_rings(signatures: Sequence[Signature]) -> list[OneRing]:
     glued = Topology(0, apart.face_sizes[lowest[apart.face_offsets[:-1]] == apart.face_offsets[:-1]], 0 * kept, names)
 
     # Vertices are numbered by their first half-edges.
-    first = np.arange(len(kept))
-    for turn in (glued.turn, glued.turn_back):
-        step = np.where(turn < 0, np.arange(len(kept)), turn)
-        for _ in range(int(np.add.reduceat(counts, first_fan).max()).bit_length()):
-            first, step = np.minimum(first, first[step]), step[step]
-    is_first = first == np.arange(len(kept))
-    vertex = (np.cumsum(is_first) - 1)[first]
-    rules = np.zeros(np.count_nonzero(is_first), dtype=np.int8)
+    _, first, fan = np.unique(fan_labels(glued)[0], return_index=True, return_inverse=True)
+    vertex = np.argsort(np.argsort(first))[fan]
+    rules = np.zeros(len(first), dtype=np.int8)
     rules[vertex[walks[stays]]] = [fan.rule for fan in fans]
 
     # Vertices around the corners, as in `Surroundings`.
