@@ -132,7 +132,7 @@ def test_face_across_one_edge_is_one_face_whichever_way_it_is_reached():
 
 
 def test_a_face_is_named_by_the_first_walk_that_arrives_there():
-    """Around a quadrilateral amid others, as the drawing at `_glued_faces` has them."""
+    """Around a quadrilateral amid others, as the drawing at `_glued_rings` has them."""
     ring = one_ring(Signature("face", (Fan((4,) * 4),) * 4))
     arrivals = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 2), (2, 3), (3, 2))
     assert [4 * face for face in range(9)] == [ring.around[corner][turns] for corner, turns in arrivals]

@@ -88,7 +88,7 @@ class Fan(NamedTuple):
 
         The vertex of an open fan depends on its two border neighbours only. A face influences only its neighbours at
         each refinement, with a small weight. So a large fan is reduced to the `NEAR_FACES` around the first face; its
-        outermost neighbours remain those on the borders (`OneRing.cut_fans`).
+        outermost neighbours remain those on the borders (`OneRing.open_fans`).
         """
         if not self.is_open or self.behind is None or self.is_semi_sharp or self.face_count <= NEAR_FACES:
             return self
