@@ -84,8 +84,8 @@ class MeshBuffers:
             self._kernel = shared(VertexKernel, table, self._types.float)
         # Used by the first evaluation alone, and kept alive for those of other shapes; None if vertices are not shared.
         self._loaded: LaterArrays | None = None
-        if self._kernel is not None and table.vertex_count <= MOST_SHARED:
-            self._loaded = _LOADED.get((self._kernel, self._parameters.surface.cage), LaterArrays)
+        if not self._is_sampled and table.vertex_count <= MOST_SHARED:
+            self._loaded = _LOADED.get((self._kernel or table, self._parameters.surface.cage), LaterArrays)
         self._is_loaded = True
         # Index of each vertex of the mesh among those of the tessellation, if seams have copies
         copied = layout.surface_vertex
@@ -112,10 +112,10 @@ class MeshBuffers:
             self.passes.begin(sources)
         # Free the memory of the last evaluation before the next one.
         self._evaluated = None
-        if self._kernel is None:
-            return self._placed(*self._on_host(points), points)
-        evaluate = partial(self._kernel.evaluated, dr.detach(points))
+        evaluate = partial(self._on_host if self._kernel is None else self._kernel.evaluated, dr.detach(points))
         vertices: tuple[FloatBuffer, FloatBuffer] = evaluate() if loaded is None else loaded.get(evaluate)
+        if self._kernel is None:
+            return self._placed(*vertices, points)
         # Also kept for a displacement, as gradients of heights may be enabled later.
         self._evaluated = vertices if moves or self._displacement is not None else None
         return self._placed(*self._kernel.attached(points, *vertices), points)
@@ -136,7 +136,7 @@ class MeshBuffers:
 
     def _on_host(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         """Evaluate positions and normals in NumPy."""
-        coordinates = np.array(dr.detach(points), dtype=np.float64).reshape(-1, 3)
+        coordinates = np.array(points, dtype=np.float64).reshape(-1, 3)
         if not self._is_sampled:
             positions, normals = self.table.apply(coordinates)
             return positions.astype(np.float32).ravel(), normals.astype(np.float32).ravel()
