@@ -97,9 +97,9 @@ def require_values(
     if is_recording() or not are_new:
         return
     take_over(values)
-    if not dr.all(dr.isfinite(values)):
-        rows = np.array(dr.detach(values)).reshape(count, size)
-        invalid = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    rows = np.array(dr.detach(values)).reshape(count, size)
+    invalid = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if invalid.size:
         first = ", ".join(map(str, rows[invalid[0]].tolist()))
         raise ValueError(f"{kind} {invalid[0]} is ({first}); expected finite numbers ({len(invalid)} such in all)")
 
