@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import itertools
 import mmap
 import re
 import traceback
@@ -345,6 +346,62 @@ def test_shapes_live_as_long_as_their_scenes():
     del scene
     gc.collect()
     assert [reference() for reference in alive] == [None] * 4
+
+
+@llvm
+def test_no_collection_comes_between_the_hits_of_a_kernel(monkeypatch):
+    # It could free another scene, after which Dr.Jit defines functions of the kernel twice, and ends the process.
+    view = {"integrator": {"type": "prb", "max_depth": 3}, "sky": {"type": "constant"}}
+    view["view"] = perspective(8, [0, 0, 4])
+    events, complete = [], exact_shading.ExactShading.complete
+
+    def launch_count():
+        return dr.detail.launch_stats()[0]
+
+    def logged(self, *arguments):
+        complete(self, *arguments)
+        events.append((launch_count(), "hit"))
+
+    def follow(phase, _info):
+        if phase == "start":
+            events.append((launch_count(), "collection"))
+
+    def step(threshold=None):
+        scene = scene_with(**view, shape=cube())
+        parameters = mi.traverse(scene)
+        dr.enable_grad(parameters["shape.control_points"])
+        parameters.update()
+        events.clear()
+        if threshold is not None:
+            gc.set_threshold(gc.get_count()[0] + threshold)
+            gc.enable()
+        dr.backward(dr.mean(dr.square(mi.render(scene, parameters, spp=1)), axis=None))
+        gc.disable()
+
+    monkeypatch.setattr(exact_shading.ExactShading, "complete", logged)
+    given, collections = gc.get_threshold(), 0
+    try:
+        gc.disable()
+        gc.collect()
+        step()
+        gc.callbacks.append(follow)
+        for threshold in range(0, 400, 20):
+            step(threshold)
+            hits = [index for index, (_, kind) in enumerate(events) if kind == "hit"]
+            for a, b in itertools.pairwise(hits):
+                assert events[a][0] != events[b][0] or b == a + 1, f"a collection after {threshold} objects"
+            collections += len(events) - len(hits)
+        assert len(hits) > 2
+        assert collections
+        gc.set_threshold(*given)
+        step()
+        gc.collect()
+        # The user's threshold is back, and stays where it is set meanwhile.
+        assert gc.get_threshold() == given
+    finally:
+        gc.callbacks.remove(follow)
+        gc.set_threshold(*given)
+        gc.enable()
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_spectral", "variant_llvm_ad_rgb")

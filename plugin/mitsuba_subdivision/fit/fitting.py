@@ -103,8 +103,9 @@ class Fit(ABC):
         number = len(self.losses)
         if self._is_time_to_refine(number):
             self.refine()
-        self.losses.append(self._step(number))
+        loss = self._step(number)
         self._since += 1
+        self.losses.append(loss)
         for callback in self._callbacks:
             callback(self)
         return self.losses[-1]
@@ -116,13 +117,25 @@ class Fit(ABC):
         ----------
         steps : int
         checkpoint : path, optional
-            Of a file that `save_checkpoint` writes after every ``every`` steps, and at the end.
+            Of a file that `save_checkpoint` writes after every ``every`` steps, and at the end; also of the last
+            complete step, if Ctrl-C interrupts.
         every : int
         """
-        for number in counted(range(1, steps + 1), "Steps"):
-            self.step()
-            if checkpoint is not None and (number % every == 0 or number == steps):
-                self.save_checkpoint(checkpoint)
+        if checkpoint is None:
+            for _ in counted(range(steps), "Steps"):
+                self.step()
+            return self
+        complete = self._arrays()
+        try:
+            for number in counted(range(1, steps + 1), "Steps"):
+                self.step()
+                complete = self._arrays()
+                if number % every == 0 or number == steps:
+                    _save(checkpoint, complete)
+        except KeyboardInterrupt:
+            # A callback is interrupted after its step.
+            _save(checkpoint, self._arrays() if len(self.losses) > len(complete["losses"]) else complete)
+            raise
         return self
 
     def _is_time_to_refine(self, number: int) -> bool:
@@ -156,10 +169,12 @@ class Fit(ABC):
         OSError
             If the file cannot be written; an existing one is then unchanged.
         """
-        arrays: dict[str, Any] = {"format": FORMAT, "losses": self.losses}
-        arrays.update(refinements=self.refinements, since=self._since, **self._state())
-        with whole_file(path) as unfinished, unfinished.open("wb") as file:
-            np.savez(file, **arrays)
+        _save(path, self._arrays())
+
+    def _arrays(self) -> dict[str, Any]:
+        """Contents of a checkpoint, which later steps leave as they are."""
+        counts = {"refinements": self.refinements, "since": self._since}
+        return {"format": FORMAT, "losses": list(self.losses), **counts, **self._state()}
 
     def resume(self, path: str | Path) -> Self:
         """Resume from a checkpoint of a fit with the same arguments.
@@ -195,6 +210,11 @@ class Fit(ABC):
         self._restore(arrays)
         self.losses, self._since = arrays["losses"].tolist(), int(arrays["since"])
         return self
+
+
+def _save(path: str | Path, arrays: dict[str, Any]) -> None:
+    with whole_file(path) as unfinished, unfinished.open("wb") as file:
+        np.savez(file, **arrays)
 
 
 @dataclass(frozen=True, eq=False)

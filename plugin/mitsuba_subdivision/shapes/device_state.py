@@ -44,6 +44,52 @@ def paused_collection() -> Iterator[None]:
             gc.enable()
 
 
+class DeferredCollection:
+    """Defers garbage collections from the first hit that a kernel traces to the launch of the kernel.
+
+    A collection may free another scene. If one comes between two virtual function calls of a kernel, Dr.Jit numbers the
+    instances of the second call anew, and may define a function twice, which ends the process. Python collects once
+    the number of new objects exceeds a threshold. A step of prb leaves ten times as many with hits that are traced in
+    Python as with those of `mi.Mesh`. So the count starts again after each hit: the threshold is raised until the next
+    collection, or until the first hit after a launch.
+    """
+
+    # Bound on the raised threshold, relative to the one of the user: hits may be traced without ever being evaluated.
+    MOST = 100
+
+    def __init__(self) -> None:
+        self._launches, self._threshold, self._raised = -1, 0, 0
+        gc.callbacks.append(self._on_collection)
+
+    @contextmanager
+    def while_tracing(self) -> Iterator[None]:
+        """Pause the collector while a hit is traced, and defer it afterwards; a context manager."""
+        launches, *_ = dr.detail.launch_stats()
+        if launches != self._launches and not is_recording():
+            # A collection that is due comes now, before anything else is traced.
+            self._restore()
+        self._launches = launches
+        with paused_collection():
+            yield
+            threshold, *others = gc.get_threshold()
+            if threshold != self._raised:
+                self._threshold = threshold
+            if self._threshold:
+                self._raised = min(gc.get_count()[0], self.MOST * self._threshold) + self._threshold
+                gc.set_threshold(self._raised, *others)
+
+    def _restore(self) -> None:
+        threshold, *others = gc.get_threshold()
+        # Unless the user has set another threshold meanwhile.
+        if threshold == self._raised:
+            gc.set_threshold(self._threshold, *others)
+        self._raised = 0
+
+    def _on_collection(self, phase: str, _info: dict[str, int]) -> None:
+        if phase == "start":
+            self._restore()
+
+
 def is_recording() -> bool:
     """Whether a frozen function is being recorded, when values of arrays cannot be read."""
     return bool(dr.flag(dr.JitFlag.FreezingScope))

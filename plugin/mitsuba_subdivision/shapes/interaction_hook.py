@@ -33,7 +33,7 @@ import mitsuba as mi
 
 from ..kernels.array_types import Mask, Value
 from ..variants import Variant, variant_name
-from .device_state import paused_collection, traversed
+from .device_state import DeferredCollection, traversed
 from .machine_code import (
     BEFORE,
     address_of,
@@ -69,6 +69,7 @@ _ATTRIBUTES = {"face_one": 1, "face_three": 3}
 # Hooks by variant. Never removed, because shapes use the functions for their whole lifetime.
 # Hooks of variants, or reasons for which these have none: the trial takes a tenth of a second.
 _hooks: dict[Variant, InteractionHook | str] = {}
+_collection = DeferredCollection()
 # Mitsuba constructs the shapes of a scene in parallel.
 _lock = threading.Lock()
 
@@ -194,8 +195,7 @@ class InteractionHook:
         if answers is None or (tag and tag not in self._tags[answers]):
             return
         variant = self._variant
-        # Freeing a scene while a frozen function is recorded ends the process.
-        with paused_collection():
+        with _collection.while_tracing():
             hit = TriangleHit(
                 object_at(variant.Ray3f, ray),
                 object_at(variant.PreliminaryIntersection3f, preliminary),
@@ -221,7 +221,7 @@ class InteractionHook:
                 return
             interaction = object_at(variant.SurfaceInteraction3f, si)
             name, mask = ctypes.string_at(text, length).decode(), object_at(variant.Mask, active)
-            with paused_collection():
+            with _collection.while_tracing():
                 value = answers.attribute(name, interaction, mask)
             size = 1 if value is None or dr.depth_v(value) == 1 else dr.size_v(value)
             if size == 3 and result_type is variant.UnpolarizedSpectrum:
