@@ -41,6 +41,34 @@ def test_a_surface_is_found_from_its_points(target, with_normals):
     assert fit.losses[-1] < 1e-5 * fit.losses[0]
 
 
+@pytest.mark.parametrize("during_callback", [False, True])
+def test_an_interrupted_run_leaves_its_last_complete_step(target, tmp_path, monkeypatch, during_callback):
+    points, path, step = target.sample(600, 1), tmp_path / "fit.npz", PointFit._step
+
+    def interrupt(fit):
+        if len(fit.losses) == 3:
+            raise KeyboardInterrupt
+
+    def interrupted(fit, number):
+        loss = step(fit, number)
+        interrupt(fit)
+        return loss
+
+    def made(**options):
+        return PointFit(moved(target.cage), points.p, refine=[2], **options)
+
+    whole = made().run(5)
+    if not during_callback:
+        monkeypatch.setattr(PointFit, "_step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        made(callbacks=[interrupt] if during_callback else []).run(5, checkpoint=path)
+    monkeypatch.undo()
+    resumed = made().resume(path)
+    assert resumed.losses == whole.losses[:3]
+    assert resumed.run(2).losses == whole.losses
+    np.testing.assert_array_equal(resumed.control_points, whole.control_points)
+
+
 def test_a_refined_cage_comes_nearer():
     """Of points of another surface, which the coarse cage cannot have."""
     directions = LimitSurface(cube()).sample(400, 2).p
