@@ -47,6 +47,8 @@ FOUR_TEXCOORDS = {"texcoords": np.zeros((4, 2))}
         ({"time": 1.0}, 'parameter "time" needs a USD file'),
         ({"to_world": np.diag([1.0, 1, 0, 1])}, 'parameter "to_world" has the determinant 0.0'),
         ({"shown_faces": np.array([6])}, 'parameter "shown_faces" has 6; expected 0 to 5'),
+        ({"shown_faces": "0-2 4-9"}, 'parameter "shown_faces" has 9; expected 0 to 5'),
+        ({"shown_faces": "1, 2"}, 'parameter "shown_faces" is "1, 2"; expected ranges such as "0-5 8"'),
         # Mitsuba would render no other shape of the scene beside one without triangles.
         ({"shown_faces": np.arange(0)}, 'parameter "shown_faces" shows no face; expected one at least'),
         (

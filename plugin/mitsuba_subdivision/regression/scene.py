@@ -169,7 +169,8 @@ def _checksums(path: Path, state: mi.parser.ParserState) -> dict[str, str]:
         for key, value in node.props.items():
             if node.props.type(key) == mi.Properties.Type.String:
                 named = Path(str(_file_resolver().resolve(value)))
-                if value and named.is_file():
+                # Of a text longer than any name, `Path.is_file` raises an error.
+                if value and os.path.isfile(named):
                     files.add(named.resolve())
     return {
         Path(os.path.relpath(file, folder)).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()

@@ -68,9 +68,9 @@ time : float
 material : string
     Show only the faces of this material, one that ``usemtl`` names in an OBJ file, or ``material_0`` and so on of a PLY
     file. Shapes of the same file and parameters, one for each material, meet without cracks. (Default: all faces)
-shown_faces : tensor
-    Show only these faces, 0-based integers. Unlike holes, the others are evaluated: shapes that differ in this
-    parameter only meet without cracks. (Default: all faces)
+shown_faces : tensor or string
+    Show only these faces, 0-based integers, in a string also ranges such as ``0-5 8``. Unlike holes, the others are
+    evaluated: shapes that differ in this parameter only meet without cracks. (Default: all faces)
 scheme : string
     Subdivision scheme: ``catmull_clark``, ``doo_sabin``, ``loop`` (triangles only), or one registered by
     ``mitsuba_subdivision.register_scheme``. (Default: the file's, or ``catmull_clark``)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import re
 import time as clock
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
@@ -18,11 +19,13 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.contents import INTERPOLATIONS, RULES, Attribute, Interpolation
-from ..cage.errors import CageSource, noting_warnings, warn, without_warnings
+from ..cage.errors import CageSource, noting_warnings, shortened, warn, without_warnings
 
 # Needed at run time: Dr.Jit resolves the annotations of dataclasses that a shape refers to.
 from ..evaluation.equations import Evaluator
 from ..files.formats import FORMATS
+from ..mesh import ragged
+from ..mesh.connectivity import IntArray
 from ..mesh.shared import Shared
 from ..surface import TEXCOORDS, LimitSurface
 from .cage_attributes import RESERVED
@@ -179,15 +182,33 @@ def _shown(props: mi.Properties, surface: LimitSurface) -> NDArray[np.bool_] | N
             raise ValueError(f'parameter "material" is "{material}"; expected {expected}')
         faces = cage.materials[material]
     else:
-        faces = _tensor(props, name, (-1,))
-        out_of_range = faces[(faces < 0) | (faces >= cage.face_count)]
+        ends = _ends_of_ranges(props, name)
+        out_of_range = ends[(ends < 0) | (ends >= cage.face_count)]
         if len(out_of_range):
             raise ValueError(f'parameter "{name}" has {out_of_range[0]}; expected 0 to {cage.face_count - 1}')
+        faces = ragged.ranges(ends[:, 0], np.maximum(ends[:, 1] - ends[:, 0] + 1, 0))
     shown = np.zeros(cage.face_count, dtype=bool)
     shown[faces] = True
     if not (shown & ~cage.is_hole).any():
         raise ValueError(f'parameter "{name}" shows no face; expected one at least that is no hole')
     return shown
+
+
+def _ends_of_ranges(props: mi.Properties, name: str) -> IntArray:
+    """First and last number ``(n, 2)`` of each range of integers in a tensor or in a text as of `ranges_as_text`."""
+    if not isinstance(props[name], str):
+        return np.repeat(_tensor(props, name, (-1,))[:, None], 2, axis=1)
+    if not re.fullmatch(r"\s*(\d{1,18}(-\d{1,18})?(\s+|$))*", props[name]):
+        raise ValueError(f'parameter "{name}" is "{shortened(props[name])}"; expected ranges such as "0-5 8"')
+    ends = [(part.split("-")[0], part.split("-")[-1]) for part in props[name].split()]
+    return np.array(ends, dtype=np.int64).reshape(-1, 2)
+
+
+def ranges_as_text(numbers: IntArray) -> str:
+    """Integers from 0 on as text: 0, 1, 2 and 5 as "0-2 5"."""
+    ordered = np.unique(numbers)
+    ranges = np.split(ordered, np.flatnonzero(np.diff(ordered) > 1) + 1)
+    return " ".join(f"{part[0]}-{part[-1]}" if len(part) > 1 else str(part[0]) for part in ranges if len(part))
 
 
 def _tessellation(props: mi.Properties) -> Tessellation:

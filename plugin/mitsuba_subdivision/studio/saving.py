@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -19,17 +20,20 @@ from ..cage import CageError, ControlCage, without_warnings
 from ..cage.contents import RULES, CageContents
 from ..files import ply, usd_stage
 from ..files.formats import write_file
-from ..shapes.parameters import is_attribute_parameter, read_attributes
+from ..shapes.parameters import is_attribute_parameter, ranges_as_text, read_attributes
 from ..variants import SceneNode
 from ..whole_file import require_writable, whole_file, write_text
 
 # Properties of the shape that `ControlCage.from_arrays` takes, too.
 _ARRAYS = ("positions", "face_sizes", "face_vertices", "creases", "corners", "holes")
-_NUMBERS = re.compile(r"<(float|rgb|lookat|scale|matrix|translate|rotate|point|vector) [^>]*>")
-_NUMBER = re.compile(r"-?\d+\.\d+(?:e[-+]?\d+)?")
+_OF_CAGE = (*_ARRAYS, *RULES)
+_NUMBERS = re.compile(r"<(float|rgb|spectrum|point|vector) [^>]*>")
+_NUMBER = re.compile(r"(?<![\w.])-?\d+\.?\d*(?:e[-+]?\d+)?(?![\w.])")
+# In place of a transform, while the scene is written.
+_PLACEHOLDER = "in place of transform"
+_TRANSFORM = re.compile(rf'( *)<string name="([^"]*)" value="{_PLACEHOLDER} (\d+)"/>\n')
 # Significant digits where single precision is not enough.
 DIGITS = 9
-_MATRIX = re.compile(r'( *)<matrix value="([^"]+)"/>')
 # Tolerance for the orthogonality of a matrix that is written as a scale and a direction.
 _ORTHOGONAL = 1e-6
 
@@ -60,43 +64,62 @@ def save_scene(
         for name, entry in scene.items()
     }
     config = mi.parser.ParserConfig(str(mi.variant()))
-    text = _readable(mi.parser.write_string(mi.parser.parse_dict(config, entries)))
+    text = _as_text(mi.parser.parse_dict(config, entries))
     written = parts.write()
     write_text(path, f'<?xml version="1.0"?>\n{text}')
     return [*written, path]
 
 
-def _readable(text: str) -> str:
-    """The text that Mitsuba writes, with transforms as look-at, and without digits beyond single precision.
+def _as_text(state: mi.parser.ParserState) -> str:
+    """A parsed scene as XML, with transforms as look-at, and without digits beyond single precision.
 
-    The difference of a look-at's points is a direction: they get more digits.
+    Mitsuba itself leaves out what is below 1e-6 in transforms, whatever the unit.
     """
+    transforms: list[NDArray[np.float64]] = []
+    for node in state.nodes:
+        for key in [key for key, _ in node.props.items() if node.props.type(key) == mi.Properties.Type.Transform]:
+            transforms.append(np.array(node.props[key].matrix, dtype=np.float64).reshape(4, 4))
+            node.props[key] = f"{_PLACEHOLDER} {len(transforms) - 1}"
+
+    def placed(tag: re.Match[str]) -> str:
+        lines = _steps(transforms[int(tag[3])])
+        inside = "".join(f"{tag[1]}    {line}\n" for line in lines)
+        return f'{tag[1]}<transform name="{tag[2]}">\n{inside}{tag[1]}</transform>\n' if lines else ""
 
     def shortened(tag: re.Match[str]) -> str:
-        if tag[1] == "lookat":
-            return _NUMBER.sub(lambda match: f"{float(match[0]):.{DIGITS}g}", tag[0])
-        return _NUMBER.sub(lambda match: str(np.float32(float(match[0]))).removesuffix(".0"), tag[0])
+        return _NUMBER.sub(lambda match: _short(float(match[0])), tag[0])
 
-    return _NUMBERS.sub(shortened, _MATRIX.sub(_placed, text))
+    text = _NUMBERS.sub(shortened, mi.parser.write_string(state))
+    return _TRANSFORM.sub(placed, text)
 
 
-def _placed(match: re.Match[str]) -> str:
-    matrix = np.array(match[2].split(), dtype=np.float64).reshape(4, 4)
+def _steps(matrix: NDArray[np.float64]) -> list[str]:
+    """Tags that make up a transform ``(4, 4)``, the first step first; none for the identity."""
     linear, origin = matrix[:3, :3], matrix[:3, 3]
-    if np.array_equal(linear, np.diag(np.diag(linear))):
-        return f"{match[1]}{_tag('scale', np.diag(linear))}\n{match[1]}{_tag('translate', origin)}"
     sides = np.linalg.norm(linear, axis=0)
-    axes = linear / sides
+    axes = linear / np.where(sides > 0, sides, 1)
+    if np.array_equal(linear, np.diag(np.diag(linear))):
+        return [*_tag("scale", np.diag(linear), 1), *_tag("translate", origin, 0)]
     if np.abs(axes.T @ axes - np.eye(3)).max() > _ORTHOGONAL or np.linalg.det(axes) < 0:
-        return match[0]
-    vectors = {"origin": origin, "target": origin + axes[:, 2], "up": axes[:, 1]}
-    directions = " ".join(f'{name}="{", ".join(map(str, vector))}"' for name, vector in vectors.items())
-    return f"{match[1]}{_tag('scale', sides)}\n{match[1]}<lookat {directions}/>"
+        return [f'<matrix value="{" ".join(map(_short, matrix.ravel().tolist()))}"/>']
+    # As far away as the origin is from 0: digits of the difference of two points are lost. They get more.
+    reach = max(1.0, float(np.abs(origin).max()))
+    vectors = {"origin": origin, "target": origin + reach * axes[:, 2], "up": axes[:, 1]}
+    directions = (f'{name}="{", ".join(f"{x:.{DIGITS}g}" for x in vector)}"' for name, vector in vectors.items())
+    sides = np.where(np.abs(sides - 1) < _ORTHOGONAL, 1, sides)
+    return [*_tag("scale", sides, 1), f"<lookat {' '.join(directions)}/>"]
 
 
-def _tag(name: str, values: NDArray[np.float64]) -> str:
-    coordinates = " ".join(f'{axis}="{value}"' for axis, value in zip("xyz", values.tolist(), strict=True))
-    return f"<{name} {coordinates}/>"
+def _tag(name: str, values: NDArray[np.float64], neutral: float) -> list[str]:
+    if (values == neutral).all():
+        return []
+    coordinates = " ".join(f'{axis}="{_short(value)}"' for axis, value in zip("xyz", values.tolist(), strict=True))
+    return [f"<{name} {coordinates}/>"]
+
+
+def _short(value: float) -> str:
+    """The fewest digits that are the same number in single precision."""
+    return str(np.float32(value)).removesuffix(".0")
 
 
 class _SceneParts:
@@ -110,6 +133,8 @@ class _SceneParts:
         self._path, self._inputs = path, list(inputs)
         self._writers: dict[Path, Callable[[Path], None]] = {}
         self._pictures: dict[str, Path] = {}
+        # Files of cages, and rules that the scene keeps, by the identity of their arrays.
+        self._cages: dict[tuple[tuple[str, Any], ...], tuple[Path, SceneNode]] = {}
 
     def in_files(self, name: str, node: SceneNode) -> SceneNode:
         """A scene entry that refers to files instead of data in memory.
@@ -122,7 +147,7 @@ class _SceneParts:
         elif "mesh" in node:
             entry = _with_name(self._file(name, ".ply", entry.pop("mesh").save), entry)
         elif "bitmap" in node:
-            entry = _with_name(self._picture(name, entry.pop("bitmap")), entry)
+            entry = _with_name(self._picture(name, entry.pop("bitmap"), bool(entry.get("raw"))), entry)
         if "filename" in entry:
             entry["filename"] = _relative(Path(entry["filename"]), self._path.parent)
         for key, value in entry.items():
@@ -150,25 +175,31 @@ class _SceneParts:
         return path
 
     def _with_cage(self, name: str, entry: SceneNode) -> SceneNode:
-        contents = _contents(entry)
-        suffix = _suffix_for(name, contents)
-        chosen = {}
-        if suffix != ".obj":
-            # Rules are tags in OBJ files. Other formats cannot hold some of them; the scene can hold all.
-            chosen = {rule: value for rule, value in contents.rules.items() if value != RULES[rule][0]}
-            contents = replace(contents, rules={})
-        beside = self._file(name, suffix, partial(write_file, contents))
-        others = (*_ARRAYS, "cage_name", *RULES)
-        kept = {key: value for key, value in entry.items() if key not in others and not is_attribute_parameter(key)}
+        of_cage = {key: value for key, value in entry.items() if key in _OF_CAGE or is_attribute_parameter(key)}
+        # Parts of a mesh have the same arrays.
+        alike = tuple((key, value if isinstance(value, str) else id(value)) for key, value in of_cage.items())
+        if alike not in self._cages:
+            contents = _contents(of_cage)
+            suffix = _suffix_for(name, contents)
+            chosen = {}
+            if suffix != ".obj":
+                # Rules are tags in OBJ files. Other formats cannot hold some of them; the scene can hold all.
+                chosen = {rule: value for rule, value in contents.rules.items() if value != RULES[rule][0]}
+                contents = replace(contents, rules={})
+            self._cages[alike] = self._file(name, suffix, partial(write_file, contents)), chosen
+        beside, chosen = self._cages[alike]
+        kept = {key: value for key, value in entry.items() if key not in of_cage and key != "cage_name"}
+        if "shown_faces" in kept:
+            kept["shown_faces"] = ranges_as_text(np.array(kept["shown_faces"]))
         return _with_name(beside, {**kept, **chosen})
 
-    def _picture(self, name: str, bitmap: mi.Bitmap) -> Path:
+    def _picture(self, name: str, bitmap: mi.Bitmap, is_raw: bool) -> Path:
         pixels = np.array(bitmap)
-        content = f"{pixels.shape} {pixels.dtype} {bitmap.srgb_gamma()}".encode() + pixels.tobytes()
+        content = f"{pixels.shape} {pixels.dtype} {bitmap.srgb_gamma()} {is_raw}".encode() + pixels.tobytes()
         digest = hashlib.sha256(content).hexdigest()
         if digest not in self._pictures:
-            # A PNG file of eight bits is decoded from sRGB.
-            in_8_bits = pixels.dtype == np.uint8 and bitmap.srgb_gamma()
+            # A PNG file of eight bits is decoded from sRGB, unless it is raw.
+            in_8_bits = pixels.dtype == np.uint8 and (is_raw or bitmap.srgb_gamma())
             if not in_8_bits:
                 bitmap = bitmap.convert(component_format=mi.Struct.Type.Float32, srgb_gamma=False)
 
