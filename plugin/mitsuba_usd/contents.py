@@ -189,6 +189,7 @@ class SceneContents:
     lights: list[LightContents] = field(default_factory=list)
     camera: CameraContents | None = None
     resolution: list[int] | None = None
+    is_transparent: bool = False  # Whether render settings ask for pictures with alpha
 
     @property
     def all_shapes(self) -> list[ShapeContents]:
@@ -210,8 +211,10 @@ class SceneContents:
 
     @property
     def is_lit(self) -> bool:
-        """Whether there are lights; emissive materials do not count."""
-        return bool(self.lights) or any(shape.radiance is not None for shape in self.all_shapes)
+        """Whether there are lights with power; emissive materials do not count."""
+        powers = [light.emission for light in self.lights]
+        powers += [shape.radiance for shape in self.all_shapes if shape.radiance is not None]
+        return any(max(power) > 0 for power in powers)
 
     @property
     def has_surfaces(self) -> bool:

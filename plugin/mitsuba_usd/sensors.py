@@ -6,7 +6,7 @@ import math
 
 import mitsuba as mi
 import numpy as np
-from mitsuba_subdivision.studio import DEFAULT_SIZE, LIGHTS, Look, View, sampler, studio
+from mitsuba_subdivision.studio import DEFAULT_SIZE, ENVIRONMENT, STUDIO, Look, View, sampler, studio
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
@@ -20,8 +20,7 @@ _LEAST_NEAR = 1e-6
 NO_BLUR = "shutters of cameras have no effect without the option --shutter of render"
 # Of pictures by a stage's camera.
 WIDTH = 640
-_LIGHTS = (*LIGHTS, "ambient_light")
-RESERVED = ("integrator", "sensor", *_LIGHTS, "ground")
+RESERVED = ("integrator", "sensor", *STUDIO, ENVIRONMENT)
 # Half the least size of what the studio is set up around, as a part of its place: a single point has no size.
 _LEAST_SIZE = 1e-6
 
@@ -118,13 +117,12 @@ def with_studio_defaults(
     scene["sensor"] = entries["sensor"] if camera is None else sensor(camera, size, look.spp, notes)
     if is_lit:
         return scene
-    for light in _LIGHTS:
-        if light in entries:
-            # The stage's own camera may be so far away that lights of a studio would be in its picture.
-            is_near = camera is not None and entries[light]["type"] == "rectangle"
-            scene[light] = _distant_light(entries[light], bounds.mean(axis=0)) if is_near else entries[light]
-    if camera is None and "ground" in entries:
-        scene["ground"] = entries["ground"]
+    for name in (name for name in STUDIO if name in entries):
+        # The stage's own camera may be so far away that lights of a studio would be in its picture.
+        is_near = camera is not None and entries[name]["type"] == "rectangle"
+        scene[name] = _distant_light(entries[name], bounds.mean(axis=0)) if is_near else entries[name]
+    if camera is not None:
+        scene.pop("ground", None)
     return scene
 
 

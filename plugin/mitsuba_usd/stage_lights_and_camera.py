@@ -42,6 +42,8 @@ _NEUTRAL_SETTINGS: dict[str, list[Any]] = {
     "materialBindingPurposes": [["full", ""], ["full", "preview"]],
     "renderingColorSpace": ["", "lin_rec709", "lin_rec709_scene"],
 }
+# As Gaffer writes this setting of Cycles.
+_TRANSPARENT = "cycles:background:transparent"
 _NEUTRAL_EXPOSURE = {
     "exposure": 0.0,
     "exposure:iso": 100.0,
@@ -145,15 +147,15 @@ def _texture(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> str | 
 
 def read_settings(
     stage: Usd.Stage, time: Usd.TimeCode, notes: StageWarnings
-) -> tuple[list[int] | None, str | None, dict[str, Any]]:
-    """Resolution and path of the camera that the render settings of a stage name, and what they change of a camera."""
+) -> tuple[dict[str, Any], str | None, dict[str, Any]]:
+    """Fields of `SceneContents` and path of the camera by the stage's render settings; what they change of a camera."""
     settings = UsdRender.Settings.GetStageRenderSettings(stage)
     if not settings:
         others = [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdRender.Settings)]
         if others or stage.HasAuthoredMetadata("renderSettingsPrimPath"):
             what = "render settings are those that renderSettingsPrimPath of the stage names; all others are ignored"
             notes.add(what, ", ".join(others) or str(stage.GetMetadata("renderSettingsPrimPath")))
-        return None, None, {}
+        return {}, None, {}
     prim = settings.GetPrim()
     path = prim.GetPath()
 
@@ -180,7 +182,8 @@ def read_settings(
         changes["shutter"] = [0.0, 0.0]
     if value("disableDepthOfField"):
         changes |= {"lens_radius": 0.0, "focus_distance": 0.0}
-    return size.tolist() if is_size else None, str(targets[0]) if targets else None, changes
+    picture = {"resolution": size.tolist() if is_size else None, "is_transparent": bool(value(_TRANSPARENT))}
+    return picture, str(targets[0]) if targets else None, changes
 
 
 def read_camera(

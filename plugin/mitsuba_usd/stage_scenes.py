@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from .stage_walk import StageReader
 
 # What differs between contents where only the camera does.
-_OF_CAMERA = frozenset({"camera", "resolution"})
+_OF_CAMERA = frozenset({"camera", "resolution", "is_transparent"})
 # Names of parameters of sensors that `mi.traverse` has others for; the field of view is along x.
 _TRAVERSED = {"fov": "x_fov"}
 
@@ -58,9 +58,12 @@ class StageScenes:
         # Number of the sub-frames of each frame, which share its samples. Their times are the middles of
         # equal parts of the interval in which the shutter of the first frame's camera is open.
         shutter: int | None = None,
+        # When the shutter opens and closes, in time codes after the time; by default, as its camera says
+        interval: tuple[float, float] | None = None,
+        over: str | Path | None = None,  # A layer that is stronger than each file
     ) -> None:
         self.name = f'"{path}"'
-        self._shutter = shutter
+        self._shutter, self._interval, self._over = shutter, interval, over
         look = replace(look, spp=-(-look.spp // (shutter or 1)))
         self._path, self._look, self._parameters = path, look, parameters
         self._time, self._camera = time, camera
@@ -81,7 +84,7 @@ class StageScenes:
         if self._first is not None and self._first[0] == number:
             return self._first[1]
         contents = self._read(number)
-        if number is None and not contents.shapes and not contents.instances:
+        if number is None and not contents.shapes and not contents.instances and self._look.has_studio:
             raise CageError(f"{self.name}: nothing is visible; expected visible meshes")
         self._first = self._first or (number, contents)
         return contents
@@ -95,28 +98,33 @@ class StageScenes:
             require_usd(f'"{path}"')
             from .stage_walk import StageReader
 
-            self._reader = StageReader(path, self._camera, self._notes)
+            self._reader = StageReader(path, self._camera, self._notes, self._over)
         contents = self._reader.at(None if time is None else time + delay)
         if mi.Float is not float:
             contents = with_large_copies(contents)
+        if self._look.environment is not None:
+            dark = [replace(shape, radiance=None) for shape in contents.shapes]
+            is_dark = all(shape.radiance is None for shape in contents.shapes)
+            contents = replace(contents, lights=[], shapes=contents.shapes if is_dark else dark)
         self._parameters = with_rate(self._parameters, contents)
         if contents.has_surfaces:
             shading = studio.shading_for(studio.variant_in_use(), self._parameters)
             self._parameters = {**self._parameters, "shading": shading}
         self._is_lit |= contents.is_lit
+        self._look = replace(self._look, transparent=self._look.transparent or contents.is_transparent)
         return contents
 
     def _delays(self, first: SceneContents) -> list[float]:
         """Times of sub-frames after the time of a frame."""
         if self._shutter is None:
             return [0.0]
-        opens, closes = first.camera.shutter if first.camera else (0.0, 0.0)
+        opens, closes = self._interval or (first.camera.shutter if first.camera else (0.0, 0.0))
         if opens >= closes:
             times = f"shutter:open is {in_digits(opens)}, and shutter:close {in_digits(closes)}"
             problem = times if first.camera else "there is no camera"
             raise CageError(
                 f"{self.name}: {problem}; expected a camera whose shutter opens before it closes, and render settings "
-                "without disableMotionBlur"
+                "without disableMotionBlur, or an interval, such as --shutter -0.25:0.25"
             )
         return [opens + (closes - opens) * (part + 0.5) / self._shutter for part in range(self._shutter)]
 
@@ -131,6 +139,24 @@ class StageScenes:
     def has_studio(self, contents: SceneContents) -> bool:
         """Whether the stage lacks a camera or lights."""
         return contents.camera is None or not contents.is_lit
+
+    def remarks(self) -> list[str]:
+        """What of a studio is added to the stage, and whether several frames are one picture."""
+        contents, reader = self._first and self._first[1], self._reader
+        if contents is None or reader is None:
+            return []
+        is_dark, has_camera = not self._is_lit and self._look.environment is None, contents.camera is not None
+        lacking = ["no camera"] * (not has_camera) + ["no visible light"] * is_dark
+        added = ["camera"] * (not has_camera) + ["lights"] * (is_dark and self._look.has_studio)
+        said = []
+        if added:
+            dark = f" ({lights})" if is_dark and (lights := reader.dark_lights()) else ""
+            what = f"the studio's {' and '.join(added)} {'are' if 'lights' in added else 'is'} added"
+            without = "; --no-studio renders without its lights" if "lights" in added else ""
+            said.append(f"{self.name}: {' and '.join(lacking)}{dark}: {what}{without}")
+        if self._files is not None and not self._files.are_many and len(self._files.numbers) > 1 and not reader.moves:
+            said.append(f"{self.name}: nothing changes with time; all frames are the same picture, but for noise")
+        return said
 
     @timed("Choosing triangles and textures")
     def scene(
@@ -148,6 +174,8 @@ class StageScenes:
         needed: dict[str, float] = {}
         is_one_picture = points is None
         points = self.points(contents) if points is None else points
+        if not len(points) and not self._look.has_studio:
+            points = np.array([[-1.0] * 3, [1.0] * 3])
         if len(points):
             rest = with_studio_defaults(contents, points, self._is_lit, self._look, self._notes, self.name)
         if rest and (turns or follows_sensor):
@@ -162,7 +190,7 @@ class StageScenes:
         self._notes.warn(self.name)
         if not rest:
             raise CageError(f"{self.name}: none of the meshes can be used; expected one")
-        return scene
+        return studio.finished(scene, self._look, contents.up)
 
     def _for_picture(
         self, contents: SceneContents, sensor: SceneNode, follows_sensor: bool
@@ -219,7 +247,7 @@ class StageScenes:
             others = {**rest, "sensor": seen}
             scene = scene_entries(contents, others, self._notes, parameters, Surfaces(), textures, loaded=shapes)
             self._notes.warn(self.name)
-            before = given, seen, studio.load_quietly(scene, filter_name)
+            before = given, seen, studio.load_quietly(studio.finished(scene, self._look, given.up), filter_name)
             yield before[2]
 
     def _sensor(self, contents: SceneContents, first: SceneContents, rest: SceneNode) -> SceneNode:
@@ -271,6 +299,8 @@ def usd_scene(
     spp: int = studio.DEFAULT_SPP,
     view: studio.View = studio.DEFAULT_VIEW,
     texture_size: int | None = None,
+    transparent: bool = False,
+    over: str | Path | None = None,
     **parameters: Any,
 ) -> SceneNode:
     """A whole USD file as a dictionary for ``mi.load_dict``.
@@ -288,7 +318,8 @@ def usd_scene(
     time : float, optional
         Time code. By default, each value is the one that does not depend on time, or else its first sample.
     camera : str, optional
-        Path of the camera, such as "/World/camera". By default that of the stage's render settings, or its first one.
+        Path of the camera, such as "/World/camera", or its name. By default that of the stage's render settings, or its
+        first one.
     size : (width, height), optional
         Of the film, in pixels. By default what the stage's render settings say, or 640 pixels wide and as high as the
         camera's aperture asks for.
@@ -299,6 +330,11 @@ def usd_scene(
     texture_size : int, optional
         Pixels along the sides of the textures of materials at most; each tile of a UDIM texture is such a texture.
         Textures that are finer than this camera shows are halved in any case.
+    transparent : bool
+        Whether pictures have alpha and no background, as where render settings of the stage ask for a ``RenderVar``
+        with alpha. The camera sees no environment, no lamps and no backdrop; meshes that emit light it sees.
+    over : str or Path, optional
+        A USD layer that is stronger than the file: materials, lights, cameras, visibility.
     **parameters
         Of every shape ``subdivision``, such as ``tessellation_rate=4`` or ``shading="vertex"``. By default shading is
         exact where ``shading="auto"`` is; elsewhere a line on standard error says why. Triangles are as few as the
@@ -336,6 +372,6 @@ def usd_scene(
     if texture_size is not None and texture_size < 1:
         raise ValueError(f"texture_size {texture_size}; expected 1 or more")
     with variant_set(mi):
-        look = studio.Look(view, size, spp, texture_size=texture_size)
-        source = StageScenes(path, look, parameters, time=time, camera=camera)
+        look = studio.Look(view, size, spp, texture_size=texture_size, transparent=transparent)
+        source = StageScenes(path, look, parameters, time=time, camera=camera, over=over)
         return with_meshes(studio.StillPicture(source).scene)

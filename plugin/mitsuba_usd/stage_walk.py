@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mitsuba_subdivision import files
@@ -22,7 +23,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel
 
 from .contents import CameraContents, InstanceContents, MaterialContents, SceneContents
 from .materialx_layers import with_documents
-from .stage_lights_and_camera import read_camera, read_light, read_settings
+from .stage_lights_and_camera import read_camera, read_emission, read_light, read_settings
 from .stage_materials import MaterialReader
 from .stage_meshes import COLORS, GPRIMS, ShapeReader, are_invertible
 from .stage_warnings import StageWarnings
@@ -47,8 +48,9 @@ class StageReader:
         path: str | Path,
         camera: str | None = None,  # Path of the camera. By default that of the stage's render settings, or the first
         notes: StageWarnings | None = None,
+        over: str | Path | None = None,  # A layer that is stronger than the file
     ) -> None:
-        self._path, self._camera, self._notes = path, camera, notes or StageWarnings()
+        self._path, self._camera, self._notes, self._over = path, camera, notes or StageWarnings(), over
         self._stage: Usd.Stage | None = None
         self._before: SceneContents | None = None
 
@@ -61,12 +63,12 @@ class StageReader:
         if time is not None and not math.isfinite(time):
             raise ValueError(f"{name}: time {time}; expected a finite number, a time code")
         with self._notes.given(str(self._path)):
-            self._stage = self._stage or files.open_stage(self._path, with_documents)
+            self._stage = self._stage or files.open_stage(self._path, with_documents, self._over)
             with files.usd_errors_at(name), files.usd_messages_of(name), timed("Reading") as at:
                 walk = _StageWalk(self._stage, name, time, self._notes, at)
                 if self._before is not None and self._is_still:
-                    camera, resolution = walk.camera(self._camera)
-                    return replace(self._before, camera=camera, resolution=resolution)
+                    camera, picture = walk.camera(self._camera)
+                    return replace(self._before, camera=camera, **picture)
                 self._before = walk.contents(self._camera)
                 return self._before
 
@@ -74,23 +76,47 @@ class StageReader:
     def _is_still(self) -> bool:
         return is_still(self._stage)
 
+    @property
+    def moves(self) -> bool:
+        """Whether anything that has been read may differ between times."""
+        return any(map(_may_vary, _all_prims(self._stage)))
+
+    def dark_lights(self) -> str:
+        """Lights of the stage that do not shine, and why; as text, empty without such lights."""
+        reasons = []
+        for prim in _all_prims(self._stage):
+            if not prim.HasAPI(UsdLux.LightAPI):
+                continue
+            if not prim.IsActive():
+                reasons.append(f"{prim.GetPath()} is inactive")
+            elif UsdGeom.Imageable(prim).ComputeVisibility() == UsdGeom.Tokens.invisible:
+                reasons.append(f"{prim.GetPath()} is invisible")
+            elif not read_emission(prim, Usd.TimeCode.EarliestTime()).any():
+                reasons.append(f"{prim.GetPath()} has no power")
+        return shortened(", ".join(reasons))
+
 
 def is_still(stage: Usd.Stage) -> bool:
     """Whether nothing but cameras, with the transforms above them alone, may differ between times."""
 
     def may_move(prim: Usd.Prim) -> bool:
-        attributes = prim.GetAuthoredAttributes()
-        # Instances go on with their velocities where positions have one time.
-        is_instancer = prim.IsA(UsdGeom.PointInstancer)
-        if not (is_instancer and any("elocities" in attribute.GetName() for attribute in attributes)) and not any(
-            attribute.ValueMightBeTimeVarying() for attribute in attributes
-        ):
-            return False
-        below = Usd.PrimRange.AllPrims(prim)
+        below = Usd.PrimRange.AllPrims(prim) if _may_vary(prim) else []
         return not all(str(part.GetTypeName()) in _OF_RIGS and not part.IsInstance() for part in below)
 
-    roots = [stage.GetPseudoRoot(), *stage.GetPrototypes()]
-    return not any(may_move(prim) for root in roots for prim in Usd.PrimRange.AllPrims(root))
+    return not any(map(may_move, _all_prims(stage)))
+
+
+def _all_prims(stage: Usd.Stage) -> Iterator[Usd.Prim]:
+    return (prim for root in (stage.GetPseudoRoot(), *stage.GetPrototypes()) for prim in Usd.PrimRange.AllPrims(root))
+
+
+def _may_vary(prim: Usd.Prim) -> bool:
+    """Whether a prim itself may differ between times."""
+    attributes = prim.GetAuthoredAttributes()
+    # Instances go on with their velocities where positions have one time.
+    is_instancer = prim.IsA(UsdGeom.PointInstancer)
+    is_moving = is_instancer and any("elocities" in attribute.GetName() for attribute in attributes)
+    return is_moving or any(attribute.ValueMightBeTimeVarying() for attribute in attributes)
 
 
 class _StageWalk:
@@ -128,27 +154,32 @@ class _StageWalk:
             else:
                 _add_copy(whole, prototype, instance)
         groups = [self._prototypes[number].shapes for number in numbers]
-        chosen, resolution = self.camera(camera)
-        return SceneContents(up, whole.shapes, groups, instances, whole.lights, chosen, resolution)
+        chosen, picture = self.camera(camera)
+        return SceneContents(up, whole.shapes, groups, instances, whole.lights, chosen, **picture)
 
-    def camera(self, path: str | None) -> tuple[CameraContents | None, list[int] | None]:
-        """The camera, and the resolution of the stage's render settings; each None if there is none."""
-        resolution, named, changes = read_settings(self._stage, self._code, self._notes)
-        path = path or named
+    def camera(self, wanted: str | None) -> tuple[CameraContents | None, dict[str, Any]]:
+        """The camera, None if there is none, and fields of `SceneContents` by the stage's render settings.
+
+        A camera is wanted by its path, or by its name if no other camera has it.
+        """
+        picture, named, changes = read_settings(self._stage, self._code, self._notes)
+        path = wanted or named
         prims = self._stage.Traverse(Usd.TraverseInstanceProxies())
         cameras = {str(prim.GetPath()): UsdGeom.Camera(prim) for prim in prims if prim.IsA(UsdGeom.Camera)}
         if path is None and not cameras:
-            return None, resolution
+            return None, picture
         if path is None:
             if len(cameras) > 1:
                 self._notes.add("there are several cameras, and the first is used", ", ".join(cameras))
             path = next(iter(cameras))
-        elif path not in cameras:
+        if path not in cameras and len(alike := [known for known in cameras if known.endswith(f"/{path}")]) == 1:
+            path = alike[0]
+        if path not in cameras:
             there = ", ".join(cameras) or "none"
             raise CageError(f'{self._name}: there is no camera "{path}"; expected one of those there are: {there}')
         to_world = self._to_world(cameras[path].GetPrim())
         try:
-            return replace(read_camera(cameras[path], to_world, self._code, self._notes), **changes), resolution
+            return replace(read_camera(cameras[path], to_world, self._code, self._notes), **changes), picture
         except (TypeError, ValueError):
             raise CageError(
                 f"{self._location(cameras[path])}: the camera is not usable; expected finite numbers, and apertures "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import sys
 from collections.abc import Callable
 from typing import Any, NoReturn, TypeVar
@@ -64,6 +65,8 @@ class CommandParser(argparse.ArgumentParser):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**{"formatter_class": _HelpFormatter, **options})
+        # Values such as -0.25:0.25 are no options either.
+        self._negative_number_matcher = re.compile(r"^-\.?\d[\d.:]*$")
 
     def error(self, message: str) -> NoReturn:
         self.print_usage(sys.stderr)

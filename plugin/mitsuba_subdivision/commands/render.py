@@ -5,14 +5,16 @@ from __future__ import annotations
 import argparse
 import json
 import pickle
+import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import islice
+from math import inf, isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from uuid import uuid4
 
 import mitsuba as mi
@@ -30,7 +32,7 @@ from ..studio.animation import FrameRange, StillPicture, Turntable
 from ..studio.cage_scenes import CageScenes
 from ..studio.picture import denoised, require_denoiser, shading_for
 from ..studio.saving import save_scene
-from ..studio.studio_entries import DEFAULT_VIEW, UP_AXES, VIEWS, Look, sampler, variant_in_use
+from ..studio.studio_entries import DEFAULT_VIEW, UP_AXES, VIEWS, Environment, Look, sampler, variant_in_use
 from ..variants import set_variant, threads_set
 from ..whole_file import require_writable, whole_file
 from .arguments import CommandParser, above_zero, add_cage_options, add_variant, checked, finite, index, positive, seed
@@ -43,15 +45,30 @@ DEFAULT_FPS = 24
 # Options about models, by the names that they have after parsing; others are about every scene.
 _OF_MODELS = (
     "view", "azimuth", "elevation", "up", "size", "scheme", "prim", "time", "rate", "shading", "checker", "cage",
-    "texture_size",
+    "texture_size", "camera", "over", "environment", "no_studio", "transparent",
 )  # fmt: skip
 _OF_FRAMES = ("turntable", "frames", "shutter", "fps")
-# Options that select one mesh of a USD file.
+# Options that select one mesh of a USD file, and those of whole ones.
 _OF_ONE_MESH = ("up", "scheme", "prim", "checker", "cage")
+_OF_STAGES = ("shutter", "texture_size", "camera", "over")
 # Options that do not apply to a model's scene.
 _OF_SCENES = ("parameters", "sensor", "share", "reference", "tolerances")
+# Options that `Look` has by the same names.
+_OF_LOOK = ("up", "size", "spp", "rate", "checker", "cage", "texture_size", "environment", "transparent")
+# Suffixes of files that Blender reads, and writes as USD files.
+_OF_BLENDER = (".blend", ".fbx", ".gltf", ".glb", ".abc", ".dae", ".stl", ".3ds")
+# Sub-frames of an interval.
+SUB_FRAMES = 16
+_WITH_ALPHA = (".exr", ".png")
 # Sides of the pictures in an MP4 file are multiples of this; others lose a row or a column.
 EVEN = 2
+
+
+class Shutter(NamedTuple):
+    """Number of sub-frames, and when it opens and closes, in time codes after the time; None for as the camera says."""
+
+    sub_frames: int
+    interval: tuple[float, float] | None = None
 
 
 def _sides(text: str) -> tuple[int, int]:
@@ -69,6 +86,29 @@ def _one_of_many(text: str) -> tuple[int, int]:
     return number, count
 
 
+def _shutter_of(text: str) -> Shutter:
+    numbers = text.split(":")
+    count = int(numbers[0] if len(numbers) == 1 else numbers[2] if len(numbers) == 3 else SUB_FRAMES)
+    return Shutter(count, None if len(numbers) == 1 else (float(numbers[0]), float(numbers[1])))
+
+
+def _environment_of(text: str) -> Environment:
+    path, turn, strength = re.fullmatch(r"(.+?)(?:,turn=([^,]*))?(?:,strength=([^,]*))?", text).groups()  # type: ignore[union-attr]
+    return Environment(Path(path), float(turn or 0), float(strength or 1))
+
+
+_shutter = checked(
+    _shutter_of,
+    lambda shutter: (
+        shutter.sub_frames > 0 and (shutter.interval is None or -inf < shutter.interval[0] < shutter.interval[1] < inf)
+    ),
+    "a number of sub-frames, or OPEN:CLOSE or OPEN:CLOSE:N, such as -0.25:0.25",
+)
+_environment = checked(
+    _environment_of,
+    lambda given: isfinite(given.turn) and 0 <= given.strength < inf,
+    "a picture, such as sky.exr or sky.exr,turn=90,strength=2",
+)
 _size = checked(_sides, lambda size: min(size) > 0, "width and height of 1 or more, such as 1280x720")
 _frame_range = checked(_numbers, lambda numbers: len(numbers) > 0, "FIRST:LAST or FIRST:LAST:STEP, such as 1:24")
 _share = checked(_one_of_many, lambda share: 1 <= share[0] <= share[1], "I/N with I from 1 to N, such as 2/8")
@@ -107,6 +147,12 @@ def render(parser: CommandParser) -> None:
     add("--size", type=_size, metavar="WxH", help=text)
     text = "pixels along the sides of a stage's textures at most (default: as many as the picture shows)"
     add("--texture-size", type=positive, metavar="N", help=text)
+    add("--over", type=Path, metavar="FILE", help="USD layer that is stronger than a stage, to change it")
+    add("--camera", metavar="NAME", help="camera of a stage: its path, or its name (default: as the stage says)")
+    text = "picture that lights in place of all lights, such as sky.exr or sky.exr,turn=90,strength=2"
+    add("--environment", type=_environment, metavar="FILE", help=text)
+    add("--no-studio", action="store_true", help="without lights and backdrop of the studio")
+    add("--transparent", action="store_true", help="with alpha, without a background")
     add("--checker", action="store_true", help="show texture coordinates as a checkerboard")
     add("--cage", action="store_true", help="draw the control cage")
     add_cage_options(models, "as many as the picture needs")
@@ -121,8 +167,11 @@ def render(parser: CommandParser) -> None:
     add("--turntable", type=positive, metavar="N", help="turn the model around once, in N frames")
     text = "times of a USD file, or numbers of files whose name has %%04d in it"
     add("--frames", type=_frame_range, metavar="FIRST:LAST[:STEP]", help=text)
-    text = "motion blur of a USD file: mean of N times while the shutter of its camera is open (default: none)"
-    add("--shutter", type=positive, metavar="N", help=text)
+    text = (
+        "motion blur of a USD file: mean of N times while the shutter of its camera is open, or in an interval "
+        f"OPEN:CLOSE or OPEN:CLOSE:N (default: none; N: {SUB_FRAMES})"
+    )
+    add("--shutter", type=_shutter, metavar="N", help=text)
     add("--fps", type=above_zero, metavar="N", help=f"frames per second of a video (default: {DEFAULT_FPS})")
     text = 'reconstruction filter instead of the scene\'s; "box" is deterministic'
     parser.add_argument("--filter", help=text)
@@ -143,6 +192,11 @@ def render(parser: CommandParser) -> None:
 def _render(options: argparse.Namespace) -> None:
     suffix = options.scene.suffix.lower()
     is_model = suffix in FORMATS
+    if suffix in _OF_BLENDER:
+        raise ValueError(
+            f'"{options.scene}" is a file for programs such as Blender, which write it as USD file; expected a model '
+            f'({", ".join(FORMATS)}): see the page "From Blender to a picture" of the guide, blender.md'
+        )
     if not is_model and suffix != SCENE_SUFFIX and not options.scene.is_file():
         expected = f"a Mitsuba scene ({SCENE_SUFFIX}) or a model ({', '.join(FORMATS)})"
         raise ValueError(f'"{options.scene}" is not a file; expected {expected}')
@@ -205,6 +259,14 @@ def _refuse_contradictions(options: argparse.Namespace, by_passes: bool) -> None
         raise ValueError(f"--batch is for passes; expected {all_options} beside it")
     if options.tolerances and not options.reference:
         raise ValueError("--tolerance is stored with a reference; expected --reference beside it")
+    if options.transparent and by_passes:
+        raise ValueError(f"--transparent is for pictures; expected no {all_options} beside it")
+    if options.transparent and suffix not in _WITH_ALPHA:
+        raise ValueError(
+            f'output "{options.output}" has no alpha; expected a name ending in {" or ".join(_WITH_ALPHA)}'
+        )
+    if options.environment and not options.environment.path.is_file():
+        raise FileNotFoundError(f'"{options.environment.path}": there is no such file; expected a picture')
     known = (*IMAGE_SUFFIXES, *(VIDEO_SUFFIXES if has_frames else ()))
     if suffix not in known:
         more = ", or --turntable or --frames for a video" if suffix in VIDEO_SUFFIXES else ""
@@ -274,19 +336,30 @@ def _write_frames(options: argparse.Namespace) -> None:
 
 def _write_image(options: argparse.Namespace, image: NDArray[np.float32], path: Path) -> None:
     with whole_file(path) as beside:
-        in_8_bits = path.suffix.lower() in (".png", ".jpg")
-        bitmap = mi.util.convert_to_bitmap(image, uint8_srgb=in_8_bits)
+        bitmap = _bitmap(image, in_8_bits=path.suffix.lower() in (".png", ".jpg"))
         if options.denoise:
             bitmap.metadata()[METADATA_ATTRIBUTE] = json.dumps({"denoised": True})
         bitmap.write(str(beside))
     print_result(path)
 
 
+def _sub_frames(options: argparse.Namespace) -> int:
+    return options.shutter.sub_frames if options.shutter else 1
+
+
+def _bitmap(image: NDArray[np.float32], *, in_8_bits: bool) -> mi.Bitmap:
+    if not in_8_bits or image.shape[2] != 4:
+        return mi.util.convert_to_bitmap(image, uint8_srgb=in_8_bits)
+    # PNG files have colours that are not multiplied by alpha.
+    rgba, straight = mi.Bitmap.PixelFormat.RGBA, mi.Bitmap.AlphaTransform.Unpremultiply
+    return mi.Bitmap(image, rgba).convert(rgba, mi.Struct.Type.UInt8, True, straight)
+
+
 def _render_picture(
     options: argparse.Namespace, scenes: Iterable[LoadedScene], spp: int | None = None
 ) -> NDArray[np.float32]:
     """Render a scene, or the mean of the scenes of a frame's sub-frames, which share no samples."""
-    count = options.shutter or 1
+    count = _sub_frames(options)
     total: Any = 0.0
     for part, loaded in enumerate(scenes):
         seed = (options.seed * count + part) % 2**32
@@ -307,7 +380,7 @@ def _pictures(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[t
     if options.save_scene:
         save_scene(shown.scene, options.save_scene, [options.scene])
     scenes = shown.frames(numbers, options.filter)
-    return ((number, _render_picture(options, islice(scenes, options.shutter or 1))) for number in numbers)
+    return ((number, _render_picture(options, islice(scenes, _sub_frames(options)))) for number in numbers)
 
 
 def _render_by_passes(options: argparse.Namespace, is_model: bool) -> None:
@@ -391,11 +464,19 @@ def _kept(command: bytes) -> tuple[argparse.Namespace, FrameRange | Turntable | 
 def _shown(options: argparse.Namespace) -> FrameRange | Turntable | StillPicture:
     """What a model's pictures show."""
     source = _source(options)
+    shown: FrameRange | Turntable | StillPicture
     if options.frames or options.shutter:
-        return FrameRange(source, options.frames or range(1, 2))
-    if options.turntable:
-        return Turntable(source, options.turntable, follows_sensor=not options.save_scene)
-    return StillPicture(source, follows_sensor=not options.save_scene)
+        shown = FrameRange(source, options.frames or range(1, 2))
+    else:
+        follows_sensor = not options.save_scene
+        shown = (
+            Turntable(source, options.turntable, follows_sensor=follows_sensor)
+            if options.turntable
+            else (StillPicture(source, follows_sensor=follows_sensor))
+        )
+    for remark in source.remarks():
+        print_remark(remark)
+    return shown
 
 
 def _source(options: argparse.Namespace) -> Any:
@@ -403,8 +484,11 @@ def _source(options: argparse.Namespace) -> Any:
     azimuth, elevation = VIEWS[options.view or DEFAULT_VIEW]
     azimuth = azimuth if options.azimuth is None else options.azimuth
     elevation = elevation if options.elevation is None else options.elevation
-    chosen = {name: getattr(options, name) for name in ("up", "size", "spp", "rate", "checker", "cage", "texture_size")}
-    look = Look(view=(azimuth, elevation), **{name: value for name, value in chosen.items() if value is not None})
+    look = Look(
+        view=(azimuth, elevation),
+        has_studio=not options.no_studio,
+        **{name: value for name in _OF_LOOK if (value := getattr(options, name)) is not None},
+    )
     which = {"time": options.time, "numbers": options.frames}
     is_usd = options.scene.suffix.lower().startswith(".usd")
     if is_usd and not any(getattr(options, name) for name in _OF_ONE_MESH):
@@ -412,12 +496,13 @@ def _source(options: argparse.Namespace) -> Any:
 
         given = {"tessellation_rate": options.rate, "shading": options.shading}
         parameters = {name: value for name, value in given.items() if value is not None}
-        return StageScenes(options.scene, look, parameters, shutter=options.shutter, **which)
-    what = f'one cage of "{options.scene}"'
-    if options.shutter:
-        raise ValueError(f"--shutter was given for {what}, which has no camera; expected a whole USD file")
-    if options.texture_size:
-        raise ValueError(f"--texture-size was given for {what}; expected it for a whole USD file")
+        count, interval = options.shutter or (None, None)
+        which |= {"camera": options.camera, "over": options.over, "shutter": count, "interval": interval}
+        return StageScenes(options.scene, look, parameters, **which)
+    for name in _OF_STAGES:
+        if getattr(options, name):
+            flag = f"--{name.replace('_', '-')}"
+            raise ValueError(f'{flag} was given for one cage of "{options.scene}"; expected it for a whole USD file')
     shading = shading_for(variant_in_use(), {"shading": options.shading or "auto"})
     return CageScenes(options.scene, replace(look, shading=shading), prim=options.prim, scheme=options.scheme, **which)
 

@@ -55,19 +55,34 @@ def open_stage(
     path: str | Path,
     # Makes of the stage and the beginning of messages one that has what USD itself cannot open
     completed: Callable[[Usd.Stage, str], Usd.Stage] | None = None,
+    over: str | Path | None = None,  # A layer that is stronger than the file
 ) -> Usd.Stage:
     """Open the stage of a file, with everything that it refers to. Warns if something of it is not there."""
+    name = f'"{path}"'
+    layer = _opened_layer(path)
+    stronger = None if over is None else _opened_layer(over)
+    from pxr import Usd
+
+    with usd_errors_at(name), usd_messages_of(name):
+        stage = Usd.Stage.Open(layer if stronger is None else _sublayered(stronger, layer))
+        if completed is not None:
+            stage = completed(stage, name)
+        _warn_of_missing(name, [str(error) for error in stage.GetCompositionErrors()])
+        if stronger is not None:
+            _warn_of_no_effect(f'"{over}"', stronger, stage)
+        return stage
+
+
+def _opened_layer(path: str | Path) -> Sdf.Layer:
     with open(path, "rb"):
         pass  # So that a missing file is an OSError, as for other formats.
     name = f'"{path}"'
     require_usd(name)
-    from pxr import Tf, Usd
+    from pxr import Sdf, Tf
 
     with usd_errors_at(name), usd_messages_of(name):
         try:
-            stage = Usd.Stage.Open(str(path))
-            if completed is not None:
-                stage = completed(stage, name)
+            return Sdf.Layer.FindOrOpen(str(path))
         except Tf.ErrorException as error:
             reason = _commentary(error)
             where = re.match(re.escape(os.path.abspath(path)) + r":(\d+):\d+: ", reason)
@@ -76,8 +91,41 @@ def open_stage(
                 what = re.sub("parse error matching .* at ", "syntax error at ", reason[where.end() :], flags=re.DOTALL)
                 name, reason = f"{name}, line {where[1]}", what
             raise CageError(f"{name}: {_clear(reason)}; expected a USD file (is it damaged?)") from None
-        _warn_of_missing(name, [str(error) for error in stage.GetCompositionErrors()])
-        return stage
+
+
+def _sublayered(stronger: Sdf.Layer, weaker: Sdf.Layer) -> Sdf.Layer:
+    """A layer of two others, with what stages have of their root layer alone, such as the up axis."""
+    from pxr import Sdf
+
+    root = Sdf.Layer.CreateAnonymous(".usda")
+    for layer in (weaker, stronger):
+        for key in layer.pseudoRoot.ListInfoKeys():
+            if key not in ("subLayers", "subLayerOffsets"):
+                root.pseudoRoot.SetInfo(key, layer.pseudoRoot.GetInfo(key))
+    root.subLayerPaths = [stronger.identifier, weaker.identifier]
+    return root
+
+
+def _warn_of_no_effect(name: str, layer: Sdf.Layer, stage: Usd.Stage) -> None:
+    """Warn of prims that a layer is over, and that are not there, or are parts of instances, where USD ignores it."""
+    missing: list[str] = []
+    in_instances: list[str] = []
+
+    def visit(path: Sdf.Path) -> None:
+        if not path.IsPrimPath() or path.ContainsPrimVariantSelection():
+            return
+        prim = stage.GetPrimAtPath(path)
+        if not prim or not (prim.IsDefined() or len(prim.GetPrimStack()) > 1):
+            missing.append(str(path))
+        elif prim.IsInstanceProxy():
+            in_instances.append(str(path))
+
+    layer.Traverse(layer.pseudoRoot.path, visit)
+    if missing:
+        warn(f"{name}: there are no prims {_listed(sorted(missing), 3)}; expected some to change")
+    if in_instances:
+        parts = _listed(sorted(in_instances), 3)
+        warn(f"{name}: {parts} are parts of instances, which USD shares; expected instanceable = false above them")
 
 
 def _warn_of_missing(name: str, errors: list[str]) -> None:

@@ -196,11 +196,12 @@ def _shown(props: mi.Properties, surface: LimitSurface) -> NDArray[np.bool_] | N
 
 def _ends_of_ranges(props: mi.Properties, name: str) -> IntArray:
     """First and last number ``(n, 2)`` of each range of integers in a tensor or in a text as of `ranges_as_text`."""
-    if not isinstance(props[name], str):
+    text = props[name]
+    if not isinstance(text, str):
         return np.repeat(_tensor(props, name, (-1,))[:, None], 2, axis=1)
-    if not re.fullmatch(r"\s*(\d{1,18}(-\d{1,18})?(\s+|$))*", props[name]):
-        raise ValueError(f'parameter "{name}" is "{shortened(props[name])}"; expected ranges such as "0-5 8"')
-    ends = [(part.split("-")[0], part.split("-")[-1]) for part in props[name].split()]
+    if not re.fullmatch(r"\s*(\d{1,18}(-\d{1,18})?(\s+|$))*", text):
+        raise ValueError(f'parameter "{name}" is "{shortened(text)}"; expected ranges such as "0-5 8"')
+    ends = [(part.split("-")[0], part.split("-")[-1]) for part in text.split()]
     return np.array(ends, dtype=np.int64).reshape(-1, 2)
 
 

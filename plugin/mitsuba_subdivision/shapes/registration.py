@@ -73,11 +73,13 @@ def register_variant(variant: ModuleType | str) -> type:
     with _lock, paused_collection():
         for variant_to_register in (QUERY_VARIANT, name):
             if variant_to_register not in _registered:
+                from .foreground import FOREGROUND, make_foreground
                 from .subdivision_shape import make_subdivision
 
                 module = getattr(mi, variant_to_register)
                 shape = make_subdivision(module)
                 module.register_shape(PLUGIN_NAME, shape)
+                module.register_integrator(FOREGROUND, make_foreground(module))
                 _registered[variant_to_register] = shape
         return _registered[name]
 

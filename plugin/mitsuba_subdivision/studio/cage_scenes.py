@@ -29,7 +29,7 @@ from ..variants import SceneNode
 from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
 from .obj_materials import Material, material_bsdf, material_emitter, read_materials
 from .picture import MOST_SEGMENTS, highest_rate, outline_for, segments_for, shading_for, triangles_for
-from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, DEFAULT_VIEW, Look, View, studio, variant_in_use
+from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, DEFAULT_VIEW, Look, View, finished, studio, variant_in_use
 
 CLAY = (0.56, 0.52, 0.47)
 CHECKER = (0.15, 0.23, 0.32), (0.72, 0.68, 0.61)
@@ -223,6 +223,10 @@ class CageScenes:
         """Whether the camera or the lights are those of the studio, which depend on the points: of a cage they are."""
         return True
 
+    def remarks(self) -> list[str]:
+        """What is to be said of the pictures, as all sources have it: of a cage, nothing."""
+        return []
+
     def scene(
         self,
         contents: PosedModel,
@@ -248,7 +252,7 @@ class CageScenes:
         is_adaptive = follows_sensor and look.rate is None and look.shading == "exact"
         triangles = model.triangles_for(staged["sensor"]) if is_adaptive else None
         first = {name: staged.pop(name) for name in ("integrator", "sensor")}
-        return {"type": "scene", **first, **self._shapes(model, triangles), **staged}
+        return finished({"type": "scene", **first, **self._shapes(model, triangles), **staged}, look, up)
 
     def frames(
         self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None

@@ -6,6 +6,8 @@ import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import isqrt
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import mitsuba as mi
 import numpy as np
@@ -14,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..cage import ControlCage
 from ..cage.errors import CageSource, in_digits, warn
 from ..mitsuba_mesh import box_corners
+from ..shapes.foreground import FOREGROUND
 from ..variants import SceneNode
 
 # Azimuth and elevation in degrees. Azimuth 0 is the model's front, 90 its own left, which is +x.
@@ -46,14 +49,25 @@ LIGHTS = {
     "fill_light": ((5.5, -4.0, 1.6), (2.5, 2.5), (0.55, 0.58, 0.62), 0.25),
     "rim_light": ((3.6, 4.4, 3.8), (1.6, 1.6), (8.5, 9.0, 9.6), 2.0),
 }
+# Lights and backdrop.
+STUDIO = (*LIGHTS, "ambient_light", "ground")
+ENVIRONMENT = "environment"
 # Entries that turn with the camera.
-RIG = (*LIGHTS, "ground")
+RIG = (*LIGHTS, "ground", ENVIRONMENT)
 AMBIENT = (0.17, 0.175, 0.185)
 BACKDROP_COLOUR = (0.30, 0.305, 0.315)
 # Distances behind the model's middle, in radii, at which the backdrop begins to bend and its wall stands.
 BEND, WALL = 1.6, 7.0
 # Distance of the floor below the model, in radii: a flat model must not coincide with the floor.
 GAP = 0.003
+
+
+class Environment(NamedTuple):
+    """A picture of all directions that shines, of equal angles, as USD's dome lights have."""
+
+    path: Path
+    turn: float = 0.0  # About the axis that points up, in degrees, counter-clockwise seen from above
+    strength: float = 1.0  # Factor of its radiance
 
 
 @dataclass(frozen=True)
@@ -72,6 +86,9 @@ class Look:
     cage: bool = False  # Whether the control cage is drawn over its surface
     # Pixels along the sides of the textures of a stage's materials at most; None for as many as the picture shows
     texture_size: int | None = None
+    transparent: bool = False  # Whether the picture has alpha and no background
+    has_studio: bool = True  # Whether lights and backdrop of the studio are added where they are missing
+    environment: Environment | None = None  # In place of all lights and the backdrop
 
 
 def studio(
@@ -147,6 +164,35 @@ def studio(
             "bsdf": {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": _rgb(BACKDROP_COLOUR)}},
         }
     return scene
+
+
+def finished(scene: SceneNode, look: Look, up: str) -> SceneNode:
+    """A scene with the environment of a look, without a studio or without its background, as the look says."""
+    left: tuple[str, ...] = ("ground",) if look.transparent else ()
+    if look.environment is not None or not look.has_studio:
+        left = STUDIO
+    scene = {name: entry for name, entry in scene.items() if name not in left}
+    if look.environment is not None:
+        matrix = studio_axes(up) @ turned(look.environment.turn) @ studio_axes("y").T
+        to_world, name = _transform(matrix, np.zeros(3)), str(look.environment.path.resolve())
+        picture = {"filename": name, "scale": look.environment.strength, "to_world": to_world}
+        scene[ENVIRONMENT] = {"type": "envmap", **picture}
+    return _without_background(scene) if look.transparent else scene
+
+
+def _without_background(scene: SceneNode) -> SceneNode:
+    """A scene whose film has alpha, and whose camera sees neither environment nor lamps."""
+    hidden = {**scene["integrator"], "hide_emitters": True}
+    if any(map(_is_glowing_mesh, scene.values())):
+        hidden = {"type": FOREGROUND, "hidden": hidden, "shown": scene["integrator"]}
+    film = {**scene["sensor"]["film"], "pixel_format": "rgba"}
+    return {**scene, "integrator": hidden, "sensor": {**scene["sensor"], "film": film}}
+
+
+def _is_glowing_mesh(entry: Any) -> bool:
+    if isinstance(entry, mi.Shape):
+        return entry.is_emitter() and entry.is_mesh()
+    return isinstance(entry, dict) and "emitter" in entry and entry["type"] in ("subdivision", "ply")
 
 
 def framed(
