@@ -17,6 +17,7 @@ def test_the_scalar_variant_works_and_all_is_told(monkeypatch, capsys):
     told = capsys.readouterr().out
     assert "scalar_rgb" in told
     assert "works (" in told
+    assert "; exact shading needs a variant of llvm or cuda\n" in told
     assert 'not available: unknown variant "cuda_ad_spectral_polarized_double"' in told
     assert told.endswith("everything that this machine should support works\n")
     for package in doctor.PACKAGES:

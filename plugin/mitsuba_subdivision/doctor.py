@@ -70,9 +70,9 @@ def in_words(diagnosis: dict[str, Any]) -> str:
     lines.append(("LLVM, Mitsuba first", f"version {late}{too_old}" if late else "none"))
     for name, report in diagnosis["variants"].items():
         if report["works"]:
-            exact = "works" if report["exact_shading"] else f"does not work: {report['exact_problem']}"
+            exact = report["exact_problem"] or "exact shading works"
             loaded = f", LLVM {report['llvm']}" if report["llvm"] and name.startswith("llvm") else ""
-            lines.append((name, f"works ({report['seconds']:.1f} s{loaded}); exact shading {exact}"))
+            lines.append((name, f"works ({report['seconds']:.1f} s{loaded}); {exact}"))
         else:
             lines.append((name, f"{'not available' if report['works'] is None else 'FAILS'}: {report['problem']}"))
     for name, packages in diagnosis["extras"].items():
@@ -125,14 +125,18 @@ def _report(variant: str) -> dict[str, Any]:
     """What `try_variant` returns, from a trial in this process."""
     import mitsuba as mi
 
+    from .shapes.interaction_hook import exact_shading_problem
+
     report = {"works": None, "llvm": loaded_version()}
     if problem := variant_problem(variant):
         return {**report, "problem": problem}
     mi.set_variant(variant)
     if problem := _problem(shading="vertex", tessellation_rate=2):
         return {**report, "works": False, "problem": problem}
+    problem = exact_shading_problem(getattr(mi, variant))
     # The triangles of one segment per edge lie far below the surface.
-    problem = _problem(shading="exact", tessellation_rate=1)
+    if problem is None and (wrong := _problem(shading="exact", tessellation_rate=1)):
+        problem = f"exact shading does not work: {wrong}"
     return {**report, "works": True, "exact_shading": problem is None, "exact_problem": problem}
 
 

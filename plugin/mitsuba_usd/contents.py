@@ -211,10 +211,8 @@ class SceneContents:
 
     @property
     def is_lit(self) -> bool:
-        """Whether there are lights with power; emissive materials do not count."""
-        powers = [light.emission for light in self.lights]
-        powers += [shape.radiance for shape in self.all_shapes if shape.radiance is not None]
-        return any(max(power) > 0 for power in powers)
+        """Whether there are lights; emissive materials do not count."""
+        return bool(self.lights) or any(shape.radiance and any(shape.radiance) for shape in self.all_shapes)
 
     @property
     def has_surfaces(self) -> bool:

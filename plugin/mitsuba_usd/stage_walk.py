@@ -249,7 +249,8 @@ class _StageWalk:
         elif prim.HasAPI(UsdLux.LightAPI):
             files.require_types(prim, self._code)
             light = read_light(prim, matrix(), self._code, self._notes)
-            below.lights.extend([] if light is None else [replace(light, name=name)])
+            # Without power, it would only keep the studio's lights away.
+            below.lights.extend([replace(light, name=name)] if light and any(light.emission) else [])
         elif str(prim.GetTypeName()) not in _SILENT:
             self._notes.add(f"prims of type {prim.GetTypeName()} are ignored", prim.GetPath())
 
