@@ -8,6 +8,7 @@ materialx_layers.py          the USD layers and the node library of MaterialX
 contents.py                  the plain data
 surface_models.py            models of surfaces, by the inputs that all share
 materialx_nodes.py           nodes of MaterialX, evaluated to numbers or pictures
+scaling.py                   contents in a larger unit
 copies.py                    replaces many instances by meshes
 picture_detail.py            triangles and pixels of textures that a picture needs
 bsdfs.py, textures.py, texture_image.py, emitters.py, sensors.py   build scene entries from the data

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
 from .picture_detail import is_chosen, segments_of, texels_for_pictures, triangles_for_picture, with_rate
+from .scaling import scaled, scaled_camera, size_of
 from .scene_entries import LoadedShapes, Surfaces, scene_entries
 from .sensors import NO_BLUR, angles_for, sensor, size_for, with_studio_defaults
 from .stage_warnings import StageWarnings
@@ -74,6 +75,9 @@ class StageScenes:
         self._reader: StageReader | None = None
         self._notes = StageWarnings([NO_BLUR] if shutter else [])
         self._surfaces = Surfaces()
+        # By which the scene is larger than the stage; and the stage's last contents, with those of the scene.
+        self.factor: float | None = None
+        self._before: tuple[SceneContents, SceneContents] | None = None
         self._first: tuple[int | None, SceneContents] | None = None
         self._is_lit = False
         # Of the textures of all frames.
@@ -99,7 +103,7 @@ class StageScenes:
             from .stage_walk import StageReader
 
             self._reader = StageReader(path, self._camera, self._notes, self._over)
-        contents = self._reader.at(None if time is None else time + delay)
+        contents = self._enlarged(self._reader.at(None if time is None else time + delay))
         if mi.Float is not float:
             contents = with_large_copies(contents)
         if self._look.environment is not None:
@@ -113,6 +117,17 @@ class StageScenes:
         self._is_lit |= contents.is_lit
         self._look = replace(self._look, transparent=self._look.transparent or contents.is_transparent)
         return contents
+
+    def _enlarged(self, given: SceneContents) -> SceneContents:
+        """Contents with the lengths that they have in the scene; where only the camera moves, of the same shapes."""
+        if self.factor is None:
+            self.factor = studio.enlargement(size_of(given)) if self._look.scales else 1.0
+        if self.factor == 1:
+            return given
+        if self._before is None or self._before[0].shapes is not given.shapes:
+            self._before = given, scaled(given, self.factor)
+        camera = None if given.camera is None else scaled_camera(given.camera, self.factor)
+        return replace(self._before[1], camera=camera, resolution=given.resolution)
 
     def _delays(self, first: SceneContents) -> list[float]:
         """Times of sub-frames after the time of a frame."""

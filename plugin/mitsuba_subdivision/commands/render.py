@@ -476,6 +476,8 @@ def _shown(options: argparse.Namespace) -> FrameRange | Turntable | StillPicture
         )
     for remark in source.remarks():
         print_remark(remark)
+    if options.save_scene and source.factor != 1:
+        print_remark(f"{source.name}: lengths of the saved scene are {source.factor:g} times those of the small model")
     return shown
 
 
@@ -487,6 +489,7 @@ def _source(options: argparse.Namespace) -> Any:
     look = Look(
         view=(azimuth, elevation),
         has_studio=not options.no_studio,
+        scales=True,
         **{name: value for name in _OF_LOOK if (value := getattr(options, name)) is not None},
     )
     which = {"time": options.time, "numbers": options.frames}

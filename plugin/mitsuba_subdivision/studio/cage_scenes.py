@@ -29,7 +29,17 @@ from ..variants import SceneNode
 from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
 from .obj_materials import Material, material_bsdf, material_emitter, read_materials
 from .picture import MOST_SEGMENTS, highest_rate, outline_for, segments_for, shading_for, triangles_for
-from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, DEFAULT_VIEW, Look, View, finished, studio, variant_in_use
+from .studio_entries import (
+    DEFAULT_SIZE,
+    DEFAULT_SPP,
+    DEFAULT_VIEW,
+    Look,
+    View,
+    enlargement,
+    finished,
+    studio,
+    variant_in_use,
+)
 
 CLAY = (0.56, 0.52, 0.47)
 CHECKER = (0.15, 0.23, 0.32), (0.72, 0.68, 0.61)
@@ -135,10 +145,11 @@ class Model:
         balls = control_points[np.unique(self.cage.edges), None] + corners
         return np.concatenate([tubes.reshape(-1, 3), balls.reshape(-1, 3)])
 
-    def triangles_for(self, sensor: SceneNode) -> SceneNode:
+    def triangles_for(self, sensor: SceneNode, factor: float = 1.0) -> SceneNode:
         """Parameters of the coarsest exactly shaded tessellation whose facets this sensor of a scene does not see."""
         outline, corners = outline_for(sensor), int(self.cage.face_sizes.sum())
-        segments = segments_for(self.cage, np.eye(4)[None], outline, sensor["near_clip"], "exact")
+        to_world = np.diag([factor, factor, factor, 1.0])[None]
+        segments = segments_for(self.cage, to_world, outline, sensor["near_clip"], "exact")
         highest = highest_rate(segments, np.array([corners]))
         return triangles_for(int(segments[0]), corners, min(MOST_SEGMENTS, highest), outline, highest)
 
@@ -182,6 +193,8 @@ class CageScenes:
         self._files = None if numbers is None else FrameFiles(Path(str(cage)), numbers)
         # Contents and model of the first frame that is read.
         self._first: Any = None
+        # By which the scene is larger than the cage.
+        self.factor: float | None = None
         self._kept = tempfile.TemporaryDirectory()
         weakref.finalize(self, self._kept.cleanup)
 
@@ -217,7 +230,10 @@ class CageScenes:
         """Points ``(n, 3)`` in the world that the camera must see: the limit surface, and the cage if it is drawn."""
         model, positions = contents
         points = model.points if positions is model.cage.positions else model.limit_points(positions)
-        return np.concatenate([points, model.wire_points(positions)]) if self._look.cage else points
+        points = np.concatenate([points, model.wire_points(positions)]) if self._look.cage else points
+        if self.factor is None:
+            self.factor = enlargement(np.ptp(points, axis=0).max()) if self._look.scales else 1.0
+        return self.factor * points
 
     def has_studio(self, contents: PosedModel) -> bool:  # noqa: ARG002 - as all sources have it
         """Whether the camera or the lights are those of the studio, which depend on the points: of a cage they are."""
@@ -250,7 +266,7 @@ class CageScenes:
         bounds = np.stack([points.min(axis=0), points.max(axis=0)])
         staged = studio(bounds, up=up, view=view, size=size, spp=look.spp, points=points, name=self.name)
         is_adaptive = follows_sensor and look.rate is None and look.shading == "exact"
-        triangles = model.triangles_for(staged["sensor"]) if is_adaptive else None
+        triangles = model.triangles_for(staged["sensor"], self.factor or 1.0) if is_adaptive else None
         first = {name: staged.pop(name) for name in ("integrator", "sensor")}
         return finished({"type": "scene", **first, **self._shapes(model, triangles), **staged}, look, up)
 
@@ -287,13 +303,15 @@ class CageScenes:
             cage = {"filename": str(model.path.resolve()), **model.chosen}
         triangles = triangles or {"tessellation_rate": look.rate or model.default_rate}
         shading = {} if look.shading == "vertex" else {"shading": look.shading}
-        surface = {"type": "subdivision", **cage, **triangles, **shading}
+        factor = self.factor or 1.0
+        larger = {} if factor == 1 else {"to_world": mi.ScalarTransform4f().scale(factor)}
+        surface = {"type": "subdivision", **cage, **triangles, **shading, **larger}
         surfaces = {} if look.checker else _in_materials(model, surface, in_memory)
         surfaces = surfaces or {"surface": {**surface, "bsdf": _material(model.cage, look.checker)}}
         if not look.cage:
             return surfaces
         bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(WIRE_COLOUR)}}
-        wire = {"type": "subdivision", **model.wire_cage.as_properties(mi), "tessellation_rate": WIRE_RATE}
+        wire = {"type": "subdivision", **model.wire_cage.as_properties(mi), "tessellation_rate": WIRE_RATE, **larger}
         return {**surfaces, "cage": {**wire, "bsdf": bsdf}}
 
 

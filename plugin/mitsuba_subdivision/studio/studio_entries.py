@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isqrt
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -39,6 +39,9 @@ NEAREST = 0.25
 DEFAULT_SIZE, DEFAULT_SPP, LARGEST_SIDE = (640, 480), 64, 1 << 14
 # Sizes of models that Mitsuba renders alike, as measured: lengths are squared in single precision.
 SIZES = (1e-9, 5e8)
+# Largest side of models that are enlarged, and the least side that they get: Mitsuba moves the origins of rays from
+# surfaces away by 9e-5 of a unit, or of their coordinates if these are more.
+SMALL, LARGE_ENOUGH = 1.0, 8.0
 # Of boxes: points beyond are infinite in single precision.
 LARGEST_BOX = 1e37
 
@@ -88,7 +91,13 @@ class Look:
     texture_size: int | None = None
     transparent: bool = False  # Whether the picture has alpha and no background
     has_studio: bool = True  # Whether lights and backdrop of the studio are added where they are missing
+    scales: bool = False  # Whether a scene is made larger by `enlargement`
     environment: Environment | None = None  # In place of all lights and the backdrop
+
+
+def enlargement(size: float) -> float:
+    """Factor of all lengths, a power of two, for a model whose largest side is given: 1 unless it is small."""
+    return 2.0 ** math.ceil(math.log2(LARGE_ENOUGH / size)) if 0 < size < SMALL else 1.0
 
 
 def studio(
@@ -281,7 +290,7 @@ def sampler(spp: int) -> SceneNode:
 
     They fill a grid: 32 become 35, as 5 times 7, what Mitsuba would make them with a warning.
     """
-    rows = isqrt(spp)
+    rows = math.isqrt(spp)
     return {"type": "multijitter", "sample_count": -(-spp // rows) * rows}
 
 

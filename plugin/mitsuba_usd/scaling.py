@@ -1,0 +1,74 @@
+"""Contents of a stage in another unit, so that the picture is the same.
+
+Mitsuba moves the origins of rays away from surfaces by 9e-5 of a unit, or of the distance from the origin of the world,
+if that is more. So much of a thing of a hundredth of a unit is a hundredth of it: light leaks below what stands on it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from mitsuba_subdivision.mitsuba_mesh import box_corners, points_at
+
+from .contents import CameraContents, LightContents, MaterialContents, SceneContents, ShapeContents
+
+_WITHOUT_PLACE = ("distant", "dome")
+
+
+def size_of(contents: SceneContents) -> float:
+    """The largest side of a box around all control points; 0 if there are none."""
+    boxes = [
+        points_at(box_corners(np.stack([shape.cage.positions.min(axis=0), shape.cage.positions.max(axis=0)])), matrix)
+        for shape, matrix in contents.placed_shapes
+        if len(shape.cage.positions)
+    ]
+    return float(np.ptp(np.concatenate(boxes), axis=0).max()) if boxes else 0.0
+
+
+def scaled(contents: SceneContents, factor: float) -> SceneContents:
+    """Contents with all lengths multiplied by a factor; radiances stay."""
+    scale = np.diag([factor, factor, factor, 1.0])
+    materials: dict[MaterialContents | None, MaterialContents | None] = {}
+
+    def of_material(material: MaterialContents | None) -> MaterialContents | None:
+        depth = 0.0 if material is None else material.inputs.get("depth", 0.0)
+        if material is not None and material not in materials and isinstance(depth, (int, float)) and depth > 0:
+            materials[material] = replace(material, inputs={**material.inputs, "depth": depth * factor})
+        return materials.get(material, material)
+
+    def of_shape(shape: ShapeContents, matrix: np.ndarray) -> ShapeContents:
+        return replace(shape, to_world=matrix @ shape.to_world, material=of_material(shape.material))
+
+    def of_light(light: LightContents) -> LightContents:
+        # What is given for a whole lamp is divided by its area, or by the square of the distance.
+        grows = light.is_normalized and light.kind not in _WITHOUT_PLACE
+        emission = (np.array(light.emission) * factor**2).tolist() if grows else light.emission
+        return replace(light, to_world=scale @ light.to_world, emission=emission)
+
+    inside = np.eye(4)
+    return replace(
+        contents,
+        shapes=[of_shape(shape, scale) for shape in contents.shapes],
+        groups=[[of_shape(shape, inside) for shape in group] for group in contents.groups],
+        instances=[replace(instance, to_world=scale @ instance.to_world) for instance in contents.instances],
+        lights=[of_light(light) for light in contents.lights],
+        camera=None if contents.camera is None else scaled_camera(contents.camera, factor),
+    )
+
+
+def scaled_camera(camera: CameraContents, factor: float) -> CameraContents:
+    """A camera with all lengths of the world multiplied by a factor; a film of a perspective one stays."""
+    to_world = camera.to_world.copy()
+    to_world[:3, 3] *= factor
+    film = 1.0 if camera.is_perspective else factor
+    return replace(
+        camera,
+        to_world=to_world,
+        aperture=[film * length for length in camera.aperture],
+        offset=[film * length for length in camera.offset],
+        near=factor * camera.near,
+        far=factor * camera.far,
+        lens_radius=factor * camera.lens_radius,
+        focus_distance=factor * camera.focus_distance,
+    )
