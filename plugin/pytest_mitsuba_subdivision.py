@@ -15,6 +15,11 @@ import pytest
 if TYPE_CHECKING:
     from mitsuba_subdivision.regression.fixture import RenderRegression
 
+
+class RenderWarning(pytest.PytestWarning):
+    """A comparison of renders left something undecided."""
+
+
 _REPORTED = pytest.StashKey[Path]()
 
 
@@ -80,6 +85,21 @@ def render_regression(request: pytest.FixtureRequest) -> Iterator[RenderRegressi
     yield fixture
     if fixture.reported:
         request.config.stash[_REPORTED] = fixture.results
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """List what comparisons left undecided, and after an update the references that no test used."""
+    reports = [report for kind in terminalreporter.stats.values() for report in kind]
+    found = dict.fromkeys((r.nodeid, *entry) for r in reports for entry in getattr(r, "user_properties", ()))
+    undecided = [f"{nodeid}: {text}" for nodeid, key, text in found if key == "render_undecided"]
+    references = config.rootpath / config.getini("render_references")
+    used = {references / text for _, key, text in found if key == "render_reference"}
+    is_update = used and config.getoption("render_update") != "no"
+    unused = sorted(map(str, {*references.rglob("*.exr")} - used)) if is_update else []
+    for title, lines in (("not decided", undecided), ("references that no test of this run used", unused)):
+        if lines:
+            terminalreporter.section(f"render differences: {title}")
+            terminalreporter.write_line("\n".join(lines))
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

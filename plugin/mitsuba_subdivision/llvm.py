@@ -120,6 +120,11 @@ def llvm_problem() -> str | None:
     return f"{why} ({choice.reason}): {INSTALL_HINT}"
 
 
+def imported_too_late() -> bool:
+    """Whether Dr.Jit has no usable library only because it was imported first."""
+    return llvm_problem() is not None and select_llvm().reason == _TOO_LATE and _search().path is not None
+
+
 @functools.cache
 def require_llvm() -> None:
     """Raise RuntimeError with `llvm_problem`, if any: with too old a library, the first kernel ends the process."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import platform
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias
 
-from .llvm import best_variant, llvm_problem, require_llvm
+from .llvm import best_variant, llvm_problem, loaded_version, require_llvm
 
 # The module of a variant, such as mitsuba.llvm_ad_rgb. For mypy, a class of a `ModuleType` is no base class.
 Variant: TypeAlias = Any
@@ -123,3 +125,37 @@ def variant_name(mi: ModuleType | str) -> str:
         if mi is sys.modules.get(f"mitsuba.{name}"):
             return str(name)
     raise ValueError(f"{mi!r}; expected {EXPECTED}")
+
+
+# Fields that distinguish processors of one name on x86, and that identify those of ARM, which have no name.
+_NUMBERS = ("cpu family", "model", "CPU implementer", "CPU architecture", "CPU variant", "CPU part")
+
+
+def environment(variant: str) -> dict[str, str]:
+    """Versions of libraries, and the processor, that renders in a variant depend on."""
+    import drjit
+    import mitsuba
+    import numpy
+    import scipy
+
+    # Not of this package: its changes are what the tests of renders are for.
+    modules = (mitsuba, drjit, numpy, scipy)
+    versions = {module.__name__: str(module.__version__) for module in modules} | {"processor": _processor()}
+    if variant.startswith("llvm"):
+        versions["llvm"] = str(loaded_version())
+    return versions
+
+
+def _processor() -> str:
+    # Code for another processor may add in another order. On Linux, `platform` does not know the model.
+    information = Path("/proc/cpuinfo")
+    name = _first_of(information.read_text(encoding="utf-8", errors="replace")) if information.is_file() else ""
+    return name or platform.processor() or platform.machine()
+
+
+def _first_of(information: str) -> str:
+    """The first processor of Linux's list, by its name and numbers: generations share names such as "AMD EPYC"."""
+    lines = [line.split(":", 1) for line in information.split("\n\n", 1)[0].splitlines() if ":" in line]
+    values = {name.strip(): value.strip() for name, value in lines}
+    names = ["model name", *_NUMBERS]
+    return ", ".join(f"{name} {values[name]}".removeprefix("model name ") for name in names if name in values)

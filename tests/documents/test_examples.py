@@ -151,7 +151,7 @@ def run_as_tests(block, folder):
     command = [sys.executable, "-c", PYTEST_TWICE]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.stdout.count("1 passed") == 2, done.stdout + done.stderr
-    assert os.listdir(folder / "renders" / "references") == ["my_scene.exr"]
+    assert os.listdir(folder / "renders" / "references" / "scenes") == ["my_scene.exr"]
 
 
 def requirements(extra):
@@ -262,7 +262,7 @@ def test_pages_have_blocks_of_every_kind():
     commands = [words for block in every_block if block.language == "sh" for words in block.commands]
     assert len(commands) > 25
     ours = {words[1] for words in commands if words[0] == OURS}
-    assert ours == {"compare", "doctor", "figure", "info", "merge", "render", "tessellate"}
+    assert ours == {"accept", "compare", "doctor", "figure", "info", "merge", "render", "tessellate"}
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,8 @@ BRIGHT = 20.0
 METADATA = {
     "variant": "llvm_ad_rgb",
     "filter": "box",
+    "sampler": "IndependentSampler",
+    "sensor": 0,
     "paired": {"seed": 0, "spp": BATCH},
     "environment": {"llvm": "23", "processor": "a"},
     "files": {"scene.xml": "1"},

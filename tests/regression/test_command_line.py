@@ -7,6 +7,7 @@ import sys
 import mitsuba as mi
 import numpy as np
 import pytest
+from mitsuba_subdivision import variants
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.regression.image import load_image, read_channels, write_channels, write_exr
 from regression.defects import SCENES
@@ -67,10 +68,8 @@ def test_json_on_standard_output_or_in_a_file(folder, capsys, tmp_path):
 
 
 def test_a_warning_has_a_status_of_its_own(folder, tmp_path, monkeypatch):
-    from mitsuba_subdivision.regression import scene
-
     # The scene has changed, and so has the machine: the tile tier cannot tell, at this tolerance.
-    monkeypatch.setattr(scene, "_processor", lambda: "another")
+    monkeypatch.setattr(variants, "_processor", lambda: "another")
     changed = (SCENES / "valence3.xml").read_text().replace('value="0.72, 0.66', 'value="0.7201, 0.66')
     (tmp_path / "scene.xml").write_text(changed.replace("cages/valence3", str(SCENES / "cages/valence3")))
     assert compare(folder, "reference.exr", str(tmp_path / "scene.xml"), "--tiers", "paired", "--spp", "32") == 1
@@ -175,7 +174,7 @@ def test_a_missing_pass_is_told(passes, capsys, tmp_path):
 def test_a_reference_that_is_not_finite_is_not_written(tmp_path, capsys, monkeypatch):
     pixels = np.ones((16, 16, 3), np.float32)
     pixels[3, 5, 1] = np.nan
-    monkeypatch.setattr("mitsuba_subdivision.regression.renders.render_pixels", lambda *_: pixels)
+    monkeypatch.setattr("mitsuba_subdivision.regression.renders.render_pixels", lambda *_, **__: pixels)
     assert main(["render", SCENE, "-o", str(tmp_path / "reference.exr"), "--reference", "--spp", "16", *SMALL]) == 1
     assert "is not finite: G = nan at x = 5, y = 3; channels G, variance.G" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

@@ -9,6 +9,7 @@ import OpenEXR
 import pytest
 from mitsuba_subdivision.regression import RegressionError
 from mitsuba_subdivision.regression import image as images
+from mitsuba_subdivision.regression.compare import compare
 from mitsuba_subdivision.regression.image import load_image, read_channels, save_image, write_channels, write_exr
 from regression.random_images import random_image
 
@@ -57,7 +58,7 @@ def test_any_file_with_r_g_b_is_an_image_and_standard_error_is_where_it_was_afte
 def test_other_programs_read_one_part_with_layers(tmp_path, np_rng, variant_scalar_rgb):  # noqa: ARG001
     save_image(tmp_path / "a.exr", random_image(np_rng))
     layers = dict(mi.Bitmap(str(tmp_path / "a.exr")).split())
-    assert {"<root>", "variance", "paired", "P", "Ns", "uv"} <= set(layers)
+    assert {"<root>", "variance", "paired", "probe_P", "probe_Ns", "probe_uv"} <= set(layers)
 
 
 HEADER = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
@@ -75,16 +76,71 @@ def channels(**changes):
     return {name: values for name, values in result.items() if values is not None}
 
 
+def with_windows(path, pixels, display, data, **others):
+    """Write a picture whose data window is another one than its display window."""
+    header = {**HEADER, "displayWindow": display, "dataWindow": data}
+    left, top, right, bottom = (*data[0], *data[1])
+    layers = {"RGB": pixels} | others
+    write(path, header, {n: np.ascontiguousarray(v[top : bottom + 1, left : right + 1]) for n, v in layers.items()})
+
+
+def window(left, top, right, bottom):
+    return (np.array([left, top], np.int32), np.array([right, bottom], np.int32))
+
+
+def test_pictures_are_compared_over_the_union_of_their_data_windows_within_the_display_window(tmp_path):
+    """A crop by another program is the whole with black around it; the error is the mean over the union."""
+    whole, full = np.zeros((8, 10, 3), np.float32), window(0, 0, 9, 7)
+    whole[2:5, 3:7] = 0.5
+    parts = {"whole": full, "cropped": window(3, 2, 6, 4), "other": window(3, 3, 6, 5)}
+    for name, data in parts.items():
+        with_windows(tmp_path / f"{name}.exr", whole, full, data)
+    images = {name: load_image(tmp_path / f"{name}.exr") for name in parts}
+    assert np.array_equal(images["cropped"].pixels, whole)
+    assert compare(images["whole"], images["cropped"]).exit_status == 0
+    # Rows 2 to 5 of the columns 3 to 6, where one row of four is black in the other picture.
+    result = compare(images["cropped"], images["other"])
+    assert result.exit_status == 2
+    assert result.numbers["relmse"] == pytest.approx(0.25**2 * 4 / (0.25 + 0.01) / 4)
+    assert (result.worst.y, result.worst.reference[0], result.worst.test[0]) == (2, 0.5, 0)
+    # What lies outside the display window does not count; the window may begin anywhere.
+    moved, wide = np.zeros((12, 14, 3), np.float32), window(2, 2, 11, 9)
+    moved[2:10, 2:12] = whole
+    with_windows(tmp_path / "moved.exr", moved, wide, window(2, 2, 11, 9))
+    moved[:2] = 7
+    with_windows(tmp_path / "overscan.exr", moved, wide, window(0, 0, 13, 11))
+    a, b = (load_image(tmp_path / f"{name}.exr") for name in ("moved", "overscan"))
+    assert np.array_equal(a.pixels, whole)
+    assert compare(a, b).exit_status == 0
+    with pytest.raises(
+        RegressionError, match=r"whole.exr. has 10 x 8 .* from x = 0, y = 0.*moved.exr. has 10 x 8 .* from x = 2, y = 2"
+    ):
+        compare(images["whole"], a)
+
+
+def test_layers_and_positions_of_other_programs_are_channels(tmp_path):
+    """A position pass has some names of old references' probes, and alpha comes first."""
+    layers = {"P.X": 1, "P.Y": 2, "N": 3, "A": 4}
+    write_channels(
+        tmp_path / "a.exr",
+        {**dict.fromkeys("RGB", PIXELS[..., 0]), **{n: v * PIXELS[..., 0] for n, v in layers.items()}},
+    )
+    image = load_image(tmp_path / "a.exr")
+    assert image.names == ("R", "G", "B", "A", "N", "P.X", "P.Y")
+    assert np.array_equal(image.pixels[..., 3:], PIXELS[..., :1] * [4, 3, 1, 2])
+    assert image.probe is image.estimate is None
+
+
 UNUSABLE = {
     "is not a file": lambda path: None,  # noqa: ARG005
     "not an OpenEXR file": lambda path: path.write_bytes(b"P6 4 2 255 "),
     "has 2 parts": lambda path: write(path, [OpenEXR.Part(dict(HEADER), {"RGB": PIXELS}, name) for name in "ab"]),
-    "no channels R, G, B; found Y": lambda path: write_channels(path, {"Y": PIXELS[..., 0]}),
+    "has no channel R, G, B; expected R, G, B, Y": lambda path: write_channels(path, {"Y": PIXELS[..., 0]}),
     "has no channel G; expected R, G, B": lambda path: write_channels(path, channels(G=None)),
     "has no channel variance.B": lambda path: write_channels(path, channels(**{"variance.B": None})),
     "no channel N": lambda path: write_channels(path, channels(N=None)),
     "has pixels without samples .channel N is 0": lambda path: write_channels(path, channels(N=np.zeros((2, 4), int))),
-    "without P.Y": lambda path: write_channels(path, channels(**{"P.X": PIXELS[..., 0]})),
+    "without probe_Ns.X, .*probe_P.Y": lambda path: write_channels(path, channels(**{"probe_P.X": PIXELS[..., 0]})),
     "metadata of schema 2; this version reads schema 1": lambda path: write_exr(path, PIXELS, {"schema": 2}),
     "not JSON": lambda path: write(path, {**HEADER, images.METADATA_ATTRIBUTE: "{"}, {"RGB": PIXELS}),
 }

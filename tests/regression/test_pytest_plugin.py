@@ -11,8 +11,9 @@ import numpy.fft  # noqa: F401
 import PIL.PngImagePlugin  # noqa: F401
 import pytest
 import scipy.ndimage  # noqa: F401
+from mitsuba_subdivision import variants
 from mitsuba_subdivision.__main__ import main
-from mitsuba_subdivision.regression import fixture, report  # noqa: F401
+from mitsuba_subdivision.regression import fixture, renders, report  # noqa: F401
 from mitsuba_subdivision.regression.image import load_image
 
 pytest_plugins = ["pytester"]
@@ -115,7 +116,7 @@ def test_a_difference_fails_and_leaves_a_report_and_update_writes_only_what_diff
     with_reference.runpytest("--render-update").assert_outcomes(passed=1)
     assert reference(with_reference).read_bytes() == before
     make_brighter(with_reference)
-    lines = ["*paired fail*same samples*", "*changed since the reference was made: ball.xml*"]
+    lines = ["*paired *fail*same samples*", "*changed since the reference was made: ball.xml*"]
     failing(with_reference).stdout.fnmatch_lines([*lines, "*worst pixel*of shape 0*", "*report: *index.html*"])
     (folder,) = [path for path in (with_reference.path / "failures").iterdir() if path.is_dir()]
     assert {path.name for path in folder.iterdir()} == {"index.html", "comparison.json", "maps.exr", "test.exr"}
@@ -141,9 +142,120 @@ def test_samples_are_scaled_and_other_parameters_than_the_reference_are_an_error
     (path,) = with_reference.path.glob("failures/*/comparison.json")
     assert json.loads(path.read_text())["tiers"]["tile"]["samples"] == 4 * 32
     assert with_reference.runpytest("--render-spp-scale=0").ret == pytest.ExitCode.USAGE_ERROR
-    with_reference.makepyfile(TEST.replace("spp=32", "spp=32, parameters={'albedo': 0.6}"))
-    told = "*was made with the scene parameters {}; this test has {'albedo': '0.6'}*"
+    with_reference.makepyfile(TEST.replace("spp=32", "spp=32, parameters={'albedo': 0.6}, name='ball'"))
+    told = "*was made with parameters {} and sensor 0; this test has parameters {'albedo': '0.6'} and sensor 0*"
     failing(with_reference).stdout.fnmatch_lines([told])
+
+
+SETTINGS = 'spp=4, reference_spp=64, batch=16, variant="scalar_rgb"'
+LENS = SCENE[SCENE.index("    <sensor") : SCENE.index("</sensor>") + len("</sensor>")]
+
+
+def test_references_belong_to_paths_parameters_and_sensors_and_old_ones_stay(with_reference):
+    """Two scenes of one file name, one scene with two values, and its second sensor: of four tests, none shares one."""
+    old = reference(with_reference).read_bytes()
+    for folder, albedo in (("red", "0.3"), ("blue", "0.8")):
+        with_reference.mkdir(folder)
+        two = SCENE.replace('"0.5"', f'"{albedo}"').replace(LENS, LENS + LENS.replace("<sensor", '<sensor id="b"'))
+        (with_reference.path / folder / "ball.xml").write_text(two)
+    with_reference.makepyfile(
+        TEST
+        + f"""
+def test_others(render_regression):
+    for scene, options in (("red/ball.xml", {{}}), ("blue/ball.xml", {{}}),
+                           ("red/ball.xml", {{"parameters": {{"albedo": "0.4"}}}}), ("red/ball.xml", {{"sensor": 1}})):
+        render_regression(scene, {SETTINGS}, **options)
+"""
+    )
+    with_reference.runpytest("--render-update-all", "-k", "others").assert_outcomes(passed=1, deselected=1)
+    written = {str(path.relative_to(with_reference.path)) for path in with_reference.path.rglob("*.exr")}
+    expected = {"ball", "red/ball", "blue/ball", "red/ball-albedo=0.4", "red/ball-sensor=1"}
+    assert written == {f"references/{name}.exr" for name in expected}
+    result = with_reference.runpytest("-W", "default")
+    result.assert_outcomes(passed=2, warnings=3)
+    result.stdout.fnmatch_lines(["*sensor 0 of 2 was compared; sensor=1 compares another*"])
+    assert reference(with_reference).read_bytes() == old
+    result = with_reference.runpytest("--render-update", "-k", "test_ball")
+    result.stdout.fnmatch_lines(["*references that no test of this run used*", "*blue*ball.exr"])
+    # One name for two scenes: both are told, in one run and in two.
+    both = f"render_regression(scene, name='both', {SETTINGS})"
+    with_reference.makepyfile(f"""
+def test_red(render_regression): scene = "red/ball.xml"; {both}
+def test_blue(render_regression): scene = "blue/ball.xml"; {both}
+""")
+    result = with_reference.runpytest("--render-update-all")
+    result.assert_outcomes(passed=1, failed=1)
+    result.stdout.fnmatch_lines(['*reference of "red*ball.xml" in *test_red, and of "blue*ball.xml" here; *name=..*'])
+    told = failing(with_reference, "--render-update", "-k", "blue").stdout
+    told.fnmatch_lines(["*is the reference of *red*ball.xml*, this test renders *blue*ball.xml*"])
+
+
+def test_what_is_not_decided_is_in_the_warnings_the_summary_and_junit(with_reference, monkeypatch):
+    monkeypatch.setattr(variants, "_processor", lambda: "another")
+    with_reference.makefile(".xml", ball=SCENE.replace('"0.5"', '"0.50002"'))
+    result = with_reference.runpytest("--junitxml=junit.xml", "-W", "default")
+    result.assert_outcomes(passed=1, warnings=1)
+    # Too little, beside the errors of single precision.
+    told = "*paired: same samples, but *processor another here*the tile tier decides instead*"
+    result.stdout.fnmatch_lines(["*warnings summary*", told, "*render differences: not decided*", told])
+    assert "processor another here" in (with_reference.path / "junit.xml").read_text()
+    # A change is a failure in spite of that.
+    with_reference.makefile(".xml", ball=SCENE.replace('"0.5"', '"0.505"'))
+    failing(with_reference).stdout.fnmatch_lines(["*tile *fail*", "*compared all samples of the reference*"])
+
+
+def test_wrong_files_are_told_in_one_line_before_anything_is_rendered(with_reference, monkeypatch):
+    def told(line, *options):
+        result = failing(with_reference, *options)
+        result.stdout.fnmatch_lines([line])
+        assert "Traceback" not in str(result.stdout)
+        assert "During handling" not in str(result.stdout)
+
+    path, whole = reference(with_reference), reference(with_reference).read_bytes()
+    path.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
+    told("*ball.exr* is a pointer of git-lfs *: git lfs pull")
+    pointer = path.read_bytes()
+    told("*git lfs pull*", "--render-update")
+    assert path.read_bytes() == pointer
+    path.write_bytes(whole)
+    with_reference.makefile(".xml", ball=SCENE.replace('type="sphere"', 'type="spheer"'))
+    told("At *ball.xml (line 9, *): failed to instantiate*spheer*")
+    (with_reference.path / "ball.xml").unlink()
+    told("scene * is not a file in *")
+    # The test's folder is where its scene is, wherever pytest runs.
+    (with_reference.path / "ball.xml").write_text(SCENE)
+    with_reference.mkdir("elsewhere")
+    monkeypatch.chdir(with_reference.path / "elsewhere")
+    with_reference.runpytest("..").assert_outcomes(passed=1)
+    monkeypatch.setattr(renders, "render_pass", None)
+    told(
+        'folder "/proc/references" cannot be made*',
+        "--render-update-all",
+        "-o",
+        "render_references=/proc/references",
+        "..",
+    )
+    monkeypatch.setattr(fixture, "imported_too_late", lambda: True)
+    with_reference.makepyfile(TEST.replace("scalar_rgb", "llvm_ad_rgb"))
+    told('*add "import mitsuba_subdivision" above the first "import mitsuba"*', "..")
+
+
+def test_the_pictures_of_a_failed_run_are_accepted_by_one_command(with_reference, monkeypatch, capsys):
+    monkeypatch.chdir(with_reference.path)
+    command = ["accept", "failures"]
+    assert main(command) == 3
+    assert "there is no report of a failed test in failures" in capsys.readouterr().err
+    make_brighter(with_reference)
+    failing(with_reference)
+    assert main(command) == 0
+    with_reference.runpytest("-W", "error").assert_outcomes(passed=1)
+    samples = load_image(reference(with_reference)).metadata["sampling"]
+    assert (samples["batches"], samples["batch"]) == ([[0, 32]], 16)
+    accepted = reference(with_reference).read_bytes()
+    with_reference.makefile(".xml", ball=SCENE)
+    assert main(command) == 3
+    assert "has changed since the report" in capsys.readouterr().err
+    assert reference(with_reference).read_bytes() == accepted
 
 
 def test_scenes_of_any_kind_and_wrong_ones(project):

@@ -9,12 +9,14 @@ from unittest.mock import Mock
 import mitsuba as mi
 import numpy as np
 import pytest
+from mitsuba_subdivision import variants
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.commands import render
+from mitsuba_subdivision.commands.cluster import render_on_cluster
 from mitsuba_subdivision.regression import RegressionError
 from mitsuba_subdivision.regression import scene as scenes
 from mitsuba_subdivision.regression.image import Estimate, combine, load_image, read_channels, save_image
-from mitsuba_subdivision.regression.renders import Sampling, merge_passes, render_on_cluster, render_pass
+from mitsuba_subdivision.regression.renders import Sampling, merge_passes, render_pass
 from mitsuba_subdivision.regression.scene import LEAST_PART_SPP, PART_SAMPLES, load_scene, parts_of, render_image
 from regression.defects import SCENES
 from regression.random_images import BATCH, SPREAD, estimate, truth
@@ -211,11 +213,11 @@ ARM = "processor\t: 0\nBogoMIPS\t: 243.75\nCPU implementer\t: 0x41\nCPU architec
 def test_processors_of_one_name_are_told_apart_and_those_without_have_numbers():
     """By what systems say of their first one, which cannot be had of others here."""
     another = "\nprocessor\t: 1\nmodel name\t: another one\n"
-    assert scenes._first_of(EPYC + another) == "EPYC, cpu family 26, model 2"
-    assert scenes._first_of(ARM + another) == "CPU implementer 0x41, CPU architecture 8, CPU part 0xd40"
+    assert variants._first_of(EPYC + another) == "EPYC, cpu family 26, model 2"
+    assert variants._first_of(ARM + another) == "CPU implementer 0x41, CPU architecture 8, CPU part 0xd40"
     # A list of another form gives nothing.
-    assert scenes._first_of("") == scenes._first_of("no colon\n") == ""
-    assert scenes.environment("scalar_rgb")["processor"]
+    assert variants._first_of("") == variants._first_of("no colon\n") == ""
+    assert variants.environment("scalar_rgb")["processor"]
 
 
 @pytest.mark.core

@@ -125,6 +125,12 @@ def test_the_picture_has_every_panel_with_colours_and_outlines_of_what_they_say(
         assert {(*box.get_xy(), box.get_width(), box.get_height()) for box in boxes} == expected
 
 
+def test_alpha_and_layers_have_panels_of_their_names(monkeypatch):
+    a, b = (Image("a", np.full((4, 4, 5), value), names=("R", "G", "B", "A", "nn.X")) for value in (0.5, 0.6))
+    panels = drawn(compare(a, b), monkeypatch)
+    np.testing.assert_allclose([panels[f"Difference of {name}"].images[0].get_array() for name in ("A", "nn.X")], 0.1)
+
+
 def test_images_that_are_not_finite_have_both_pictures_with_magenta(failed, monkeypatch):
     pixels = failed.test.pixels.copy()
     pixels[2, 2] = np.nan

@@ -21,6 +21,7 @@ COMMANDS = {
     "info": ("info.info", "describe a control cage"),
     "tessellate": ("info.tessellate", "write a limit surface as triangles"),
     "compare": ("compare.compare", "compare two images, or a scene with its reference"),
+    "accept": ("compare.accept", "make references of the pictures of failed tests"),
     "merge": ("compare.merge", "merge the passes of an image"),
     "doctor": ("info.doctor", "test what works on this machine"),
 }

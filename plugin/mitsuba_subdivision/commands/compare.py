@@ -1,14 +1,16 @@
-"""The commands ``compare`` and ``merge``."""
+"""The commands ``compare``, ``accept`` and ``merge``."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import shlex
 from pathlib import Path
 
 from ..messages import PROGRAM, print_remark, print_result
 from ..regression import RegressionError
+from ..regression.compare import MISSING
 from ..regression.tiers import DEFAULT_TIERS, TIERS, Tolerances
 from ..variants import variant_set
 from ..whole_file import require_folder, require_writable, write_text
@@ -36,9 +38,22 @@ def compare(parser: CommandParser) -> None:
     add("--spp", type=positive, metavar="N", help="samples per pixel of a scene (default: 256)")
     add("--seed", type=seed, metavar="N", help="other samples of a scene for each N (default: 0)")
     add_tolerances(parser, "tolerance to use instead of the reference's; can be repeated")
+    text = "what channels mean that only one image has: a file that gains a layer shows the same picture"
+    add("--missing-channels", choices=list(MISSING), default="warn", help=f"{text} (default: %(default)s)")
     add("--json", metavar="FILE", help='write the numbers as JSON; "-" is standard output')
     add("--html", type=Path, metavar="DIR", help="folder to write a report to")
     parser.set_defaults(run=_compare, error_status=UNUSABLE, usage_status=UNUSABLE)
+
+
+def accept(parser: CommandParser) -> None:
+    """Add the options of ``accept``."""
+    parser.description = (
+        "Make references of the pictures of failed tests, after a look at their reports. The scenes are rendered with "
+        "the references' samples; if these show other pictures, nothing is replaced."
+    )
+    parser.epilog = "Exit status: 0 accepted, 3 unusable input or output, or another picture."
+    parser.add_argument("reports", type=Path, metavar="DIR", help="report of a test, or folder with such reports")
+    parser.set_defaults(run=_accept, error_status=UNUSABLE, usage_status=UNUSABLE)
 
 
 def merge(parser: CommandParser) -> None:
@@ -89,10 +104,10 @@ def _compare(options: argparse.Namespace) -> int:
         from ..regression.renders import TEST_SPP, compare_scene, variant_for
 
         with variant_set(variant_for(reference)):
-            sampling = {"spp": options.spp or TEST_SPP, "seed": options.seed or 0}
-            comparison = compare_scene(reference, options.test, tiers, tolerances=tolerances, **sampling)
+            spp, seed, missing = options.spp or TEST_SPP, options.seed or 0, options.missing_channels
+            comparison = compare_scene(reference, options.test, tiers, spp, tolerances, seed=seed, missing=missing)
     else:
-        comparison = compare(reference, test, tiers, tolerances)
+        comparison = compare(reference, test, tiers, tolerances, missing=options.missing_channels)
     text = json.dumps(comparison.as_dict(), indent=1)
     if options.json and options.json != "-":
         write_text(Path(options.json), f"{text}\n")
@@ -104,6 +119,35 @@ def _compare(options: argparse.Namespace) -> int:
     elif page:
         print_result(f"  report: {page}")
     return comparison.exit_status
+
+
+def _accept(options: argparse.Namespace) -> None:
+    from ..regression import renders
+    from ..regression.compare import compare
+    from ..regression.image import load_image, save_image
+    from ..regression.scene import BOX, load_scene
+    from ..regression.tiers import Status
+
+    found = sorted(options.reports.rglob("comparison.json"))
+    failed = [path.parent for path in found if json.loads(path.read_text())["status"] == "fail"]
+    if not failed:
+        raise RegressionError(f"there is no report of a failed test in {options.reports}")
+    for folder in failed:
+        seen = load_image(folder / "test.exr")
+        if not {"scene", "reference"} <= seen.metadata.keys():
+            raise RegressionError(f'"{folder}" is of a scene in memory; accept it with pytest --render-update')
+        scene, path = (Path(os.path.relpath(folder / seen.metadata[key])) for key in ("scene", "reference"))
+        before = renders.load_reference(path)
+        require_writable(path)
+        tolerances = Tolerances().with_values(before.metadata["tolerances"])
+        with variant_set(seen.metadata["variant"]):
+            loaded = load_scene(scene, seen.metadata["parameters"], BOX, seen.metadata["sensor"])
+            image = renders.render_pass(loaded, renders.sampling_of(before), with_probe=True)
+        again = compare(image, seen, ["paired", "tile"], tolerances, missing="ignore")
+        if again.status is Status.FAIL or loaded.files != seen.metadata["files"]:
+            raise RegressionError(f'"{scene}" has changed since the report "{folder}"; expected its picture\n{again}')
+        save_image(path, renders.as_reference(image, scene, path, tolerances))
+        print_result(path)
 
 
 def _merge(options: argparse.Namespace) -> None:

@@ -253,8 +253,6 @@ def _refuse_contradictions(options: argparse.Namespace, by_passes: bool) -> None
         raise ValueError(f"--denoise removes {removed}; expected no {all_options} beside it")
     if options.denoise and has_other_filter:
         raise ValueError(f'--denoise needs the filter "{BOX}", not "{options.filter}"')
-    if options.sensor and by_passes:
-        raise ValueError(f"--sensor is for whole images; expected no {all_options} beside it")
     if options.batch and not by_passes:
         raise ValueError(f"--batch is for passes; expected {all_options} beside it")
     if options.tolerances and not options.reference:
@@ -392,7 +390,8 @@ def _render_by_passes(options: argparse.Namespace, is_model: bool) -> None:
     load: Callable[[], LoadedScene] = partial(_load_still, _as_data(options))
     if not is_model:
         path = options.scene.resolve() if options.dask else options.scene
-        load = partial(load_scene, path, dict(options.parameters), BOX if options.reference else options.filter)
+        filter_name = BOX if options.reference else options.filter
+        load = partial(load_scene, path, dict(options.parameters), filter_name, options.sensor or 0)
     loaded = load()
     require_writable(options.output, loaded.file_paths)
     spp = options.spp or (renders.REFERENCE_SPP if options.reference else loaded.sensor.sampler().sample_count())
@@ -406,7 +405,9 @@ def _render_by_passes(options: argparse.Namespace, is_model: bool) -> None:
     settings = {"with_probe": options.reference}
     with threads_set(options.threads):
         if options.dask:
-            image = renders.render_on_cluster(options.dask, load, sampling, options.passes or 0, **settings)
+            from .cluster import render_on_cluster
+
+            image = render_on_cluster(options.dask, load, sampling, options.passes or 0, **settings)
         elif options.share:
             image = renders.render_pass(loaded, sampling, number, count, **settings)
         else:
@@ -431,7 +432,7 @@ def _load_still(given: dict[str, Any]) -> LoadedScene:
 
 
 def _on_cluster(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    from ..regression.renders import cluster, results
+    from .cluster import cluster, results
 
     # The command's own number: files may change until the next one.
     command = pickle.dumps(_as_data(options) | {"command": uuid4().hex})

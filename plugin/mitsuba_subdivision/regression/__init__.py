@@ -22,3 +22,7 @@ renders of any origin.
 
 class RegressionError(ValueError):
     """A scene cannot be rendered as requested, or images cannot be read or compared."""
+
+
+class ContentElsewhere(RegressionError):
+    """A file is a pointer of git-lfs."""

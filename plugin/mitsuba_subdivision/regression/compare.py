@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import RegressionError
-from .image import Image
+from .image import RGB, Image
 from .tiers import (
     DEFAULT_TIERS,
     TIERS,
@@ -22,6 +22,7 @@ from .tiers import (
     compare_paired,
     compare_probes,
     compare_tiles,
+    levels,
     pixel_of_largest,
 )
 
@@ -37,19 +38,19 @@ class WorstPixel:
     # The pixel's values; those of the first batch if the paired tier chose it
     reference: tuple[float, ...]
     test: tuple[float, ...]
+    # R, G and B, and what else differs
+    names: tuple[str, ...] = RGB
     # The first hit of the ray through the pixel, by the reference's probe, or else the test's.
     surface: str | None = None
     # Normal in the reference and in the test, if the probe tier chose the pixel.
     normals: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def __str__(self) -> str:
-        parts = [
-            f"worst pixel ({self.shown_by}) x = {self.x}, y = {self.y}: "
-            f"reference ({_numbers(self.reference)}), test ({_numbers(self.test)})"
-        ]
-        if self.normals:
-            parts.append(f"normals ({_numbers(self.normals[0])}), ({_numbers(self.normals[1])})")
-        return "; ".join([*parts, *([self.surface] if self.surface else [])])
+        others = "" if self.names == RGB else f"{', '.join(self.names)}: "
+        values = f"{others}reference ({_numbers(self.reference)}), test ({_numbers(self.test)})"
+        normals = f"normals ({_numbers(self.normals[0])}), ({_numbers(self.normals[1])})" if self.normals else ""
+        parts = [f"worst pixel ({self.shown_by}) x = {self.x}, y = {self.y}: {values}", normals, self.surface or ""]
+        return "; ".join(filter(None, parts))
 
 
 @dataclass(eq=False)
@@ -79,7 +80,8 @@ class Comparison:
             for tier in self.tiers:
                 if tier.status is status and tier.worst is not None:
                     return _worst_pixel(self.reference, self.test, tier.worst, tier.name)
-        difference = np.abs(self.test.pixels - self.reference.pixels).max(axis=2)
+        level = np.maximum(levels(self.reference.pixels), 1e-30)
+        difference = (np.abs(self.test.pixels - self.reference.pixels) / level).max(axis=2)
         if not difference.max() > 0:
             return None
         z = self.maps.get("z")
@@ -104,13 +106,18 @@ class Comparison:
         lines = [f"{self.status.value.upper()}: {self.test.name} against {self.reference.name}"]
         for tier in self.tiers:
             first, *others = tier.lines
-            lines.append(f"  {tier.name:<7}{tier.status.value:<8} {first}")
-            lines += [f"{'':<18}{line}" for line in others]
+            lines.append(f"  {tier.name:<9}{tier.status.value:<8} {first}")
+            lines += [f"{'':<20}{line}" for line in others]
         return "\n".join([*lines, *(f"  {line}" for line in self.remarks())])
 
     def remarks(self) -> list[str]:
         """The notes, and the worst pixel in words."""
         return [*self.notes, *([str(self.worst)] if self.worst else [])]
+
+    def undecided(self) -> list[str]:
+        """What no tier decided, one text for each that warns or could not run, with its reason."""
+        tiers = [tier for tier in self.tiers if tier.status in (Status.WARN, Status.SKIPPED)]
+        return [f"{tier.name}: {'; '.join(tier.lines)}" for tier in tiers]
 
     def as_dict(self) -> dict[str, Any]:
         """The comparison as plain values, for JSON."""
@@ -118,9 +125,7 @@ class Comparison:
             "status": self.status.value,
             "reference": self.reference.name,
             "test": self.test.name,
-            "tiers": {
-                tier.name: {"status": tier.status.value, "lines": tier.lines, **tier.numbers} for tier in self.tiers
-            },
+            "tiers": {t.name: {"status": t.status.value, "lines": t.lines, **t.numbers} for t in self.tiers},
             "notes": self.notes,
             "worst_pixel": vars(self.worst) if self.worst else None,
             "tolerances": self.tolerances.as_dict(),
@@ -135,23 +140,31 @@ def compare(
     tiers: Sequence[str] | None = None,
     tolerances: Tolerances | None = None,  # By default those stored with the reference
     suite_size: int = 1,  # Number of scenes that share the probability of a false alarm
+    # What channels mean that only one image has, in `MISSING`. A warning by default: a file that gains a layer shows
+    # the same picture, but nobody should take the layer for compared.
+    missing: str = "warn",
 ) -> Comparison:
     """Compare a test with a reference.
 
     An image with pixels that are not finite fails at once, and no tier runs. The tile tier also runs, and decides,
     where the paired tier cannot: the samples are not the same, or pixels differ and so does the machine or the library.
     Where the same samples give the same bits and the probe passes, the tile tier cannot fail.
-    Raises RegressionError if an image is denoised, the sizes differ, a tier is unknown, or the images lack what a tier
-    compares that was chosen.
+    Raises RegressionError if an image is denoised, the sizes or display windows differ, a tier is unknown, or the
+    images lack what a tier compares that was chosen.
     """
     for image in (reference, test):
         if image.metadata.get("denoised"):
             raise RegressionError(
-                f'"{image.name}" is denoised, which removes what is compared; expected one as rendered'
+                f'"{image.name}" is denoised, which removes what is compared; expected it as rendered'
             )
-    if reference.size != test.size:
-        sizes = [f'"{image.name}" has {image.size[0]} x {image.size[1]} pixels' for image in (reference, test)]
-        raise RegressionError(f"{sizes[0]} and {sizes[1]}; expected the same size")
+    if (reference.size, reference.origin) != (test.size, test.origin):
+        texts = [
+            '"{}" has {} x {} pixels (display window from x = {}, y = {})'.format(
+                image.name, *image.size, *image.origin
+            )
+            for image in (reference, test)
+        ]
+        raise RegressionError(f"{texts[0]} and {texts[1]}; expected the same window")
     unknown = [name for name in tiers or () if name not in TIERS]
     if unknown:
         raise RegressionError(f'unknown tier "{unknown[0]}"; expected some of {", ".join(TIERS)}')
@@ -163,6 +176,9 @@ def compare(
             result = TierResult("finite", Status.FAIL, [f"the {role} is not: {broken[0]}"], worst=broken[1])
             return Comparison(reference, test, [result], limits)
 
+    names = tuple(name for name in reference.names if name in test.names)
+    of_missing = _missing(reference, test, missing)
+    reference, test = (image.with_channels(names) for image in (reference, test))
     compared_by: dict[str, Callable[[], TierResult]] = {
         "probe": lambda: compare_probes(reference, test, limits),
         "paired": lambda: compare_paired(reference, test, limits),
@@ -171,9 +187,32 @@ def compare(
     }
     results = {name: compared_by[name]() for name in tiers or DEFAULT_TIERS}
     _decide(results, compared_by, tiers)
-    notes = [_relative_error(reference, test), *_changed_files(reference, test)]
-    numbers = {"relmse": relmse(reference.pixels, test.pixels)}
+    notes, numbers = _relative_error(reference, test)
+    notes += _changed_files(reference, test)
+    if of_missing:
+        results["channels"] = of_missing
+    if of_missing or names != RGB:
+        notes.insert(0, f"channels compared: {', '.join(names)}")
     return Comparison(reference, test, list(results.values()), limits, notes, numbers)
+
+
+# What channels mean that only one of two images has.
+MISSING = {"ignore": Status.PASS, "warn": Status.WARN, "fail": Status.FAIL}
+
+
+def _missing(reference: Image, test: Image, meaning: str) -> TierResult | None:
+    """Channels that only one of the images has; None if there are none."""
+    if meaning not in MISSING:
+        raise RegressionError(f'missing channels "{meaning}"; expected one of {", ".join(MISSING)}')
+    lines, status = [], MISSING[meaning]
+    for role, image, other in (("reference", reference, test), ("test", test, reference)):
+        only = [name for name in image.names if name not in other.names]
+        lines += [f"only the {role} has {', '.join(only)}"] if only else []
+    if lines and meaning == "warn" and "sampling" in reference.metadata and "channels" not in reference.metadata:
+        # It stays as good as it was.
+        status = Status.PASS
+        lines.append("the reference is of an older version, which stored R, G, B: make it again to compare all")
+    return TierResult("channels", status, lines) if lines else None
 
 
 def relmse(reference: NDArray[np.floating], test: NDArray[np.floating]) -> float:
@@ -209,36 +248,37 @@ def _decide(
         tiles.lines.insert(0, "chance: the same samples give the same bits, and the probe passes")
 
 
-def _relative_error(reference: Image, test: Image) -> str:
+def _relative_error(reference: Image, test: Image) -> tuple[list[str], dict[str, Any]]:
     """The relative mean squared error, and how large noise alone would make it."""
-    measured = f"relMSE {relmse(reference.pixels, test.pixels):.3g}"
-    if reference.estimate is None or test.estimate is None:
-        return measured
-    share = (1 / reference.estimate.count + 1 / test.estimate.count)[..., None]
-    expected = np.mean(reference.estimate.variance * share / (reference.pixels**2 + 0.01))
-    return f"{measured}; noise alone would make it {expected:.3g}"
+    seen = reference.seen_with(test)
+    numbers = {"relmse": relmse(reference.rgb[seen], test.rgb[seen])}
+    text = f"relMSE {numbers['relmse']:.3g}"
+    if reference.estimate is not None and test.estimate is not None:
+        estimates = (reference.estimate, test.estimate)
+        a, b = (estimate.variance[..., :3] / estimate.count[..., None] for estimate in estimates)
+        text += f"; noise alone would make it {np.mean(((a + b) / (reference.rgb**2 + 0.01))[seen]):.3g}"
+    return [text], numbers
 
 
 def _changed_files(reference: Image, test: Image) -> list[str]:
-    before, now = (image.metadata.get("files") for image in (reference, test))
-    if not before or not now:
-        return []
-    changed = sorted(name for name in {*before, *now} if before.get(name) != now.get(name))
+    before, now = (image.metadata.get("files") or {} for image in (reference, test))
+    changed = sorted(n for n in {*before, *now} if before.get(n) != now.get(n)) if before and now else []
     return [f"changed since the reference was made: {', '.join(changed)}"] if changed else []
 
 
 def _worst_pixel(reference: Image, test: Image, pixel: tuple[int, int], shown_by: str) -> WorstPixel:
-    def values(pixels: NDArray[np.floating]) -> tuple[float, ...]:
-        return tuple(map(float, pixels[pixel]))
-
     a, b = reference.pixels, test.pixels
     if shown_by == "paired" and reference.paired is not None and test.paired is not None:
         a, b = reference.paired, test.paired
+    at = [i for i in range(a.shape[2]) if i < len(RGB) or a[pixel][i] != b[pixel][i]]
     normals = None
     if shown_by == "probe" and reference.probe and test.probe:
-        normals = values(reference.probe.normal), values(test.probe.normal)
-    probe = reference.probe or test.probe
-    return WorstPixel(*pixel, shown_by, values(a), values(b), probe.describe(*pixel) if probe else None, normals)
+        normals = tuple(reference.probe.normal[pixel].tolist()), tuple(test.probe.normal[pixel].tolist())
+    probe, shapes = reference.probe or test.probe, test.metadata.get("shapes") or reference.metadata.get("shapes", ())
+    surface = probe.describe(*pixel, shapes) if probe else None
+    names = tuple(reference.names[i] for i in at)
+    values = tuple(a[pixel][at].tolist()), tuple(b[pixel][at].tolist())
+    return WorstPixel(*pixel, shown_by, *values, names, surface, normals)
 
 
 def _numbers(values: Sequence[float]) -> str:

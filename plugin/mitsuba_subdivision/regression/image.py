@@ -7,7 +7,7 @@ import os
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import OpenEXR
 from numpy.typing import NDArray
 
 from ..whole_file import whole_file
-from . import RegressionError
+from . import ContentElsewhere, RegressionError
 
 SCHEMA = 1
 METADATA_ATTRIBUTE = "mitsuba_subdivision:metadata"
@@ -25,10 +25,15 @@ NOTHING = 2**32 - 1
 
 Channels = dict[str, NDArray]
 
-_RGB = ("R", "G", "B")
-# Channels of the fields of a probe; those of one channel are indices.
+RGB = ("R", "G", "B")
+# Channels of the fields of a probe; those of one channel are indices. Before them comes `_OF_PROBE`, which files of
+# older versions lack: there, AOVs of these names would be taken for a probe.
+_OF_PROBE = "probe_"
 _PROBE = {"position": ("P.X", "P.Y", "P.Z"), "normal": ("Ns.X", "Ns.Y", "Ns.Z"), "uv": ("uv.U", "uv.V")}
 _PROBE |= {"shape": ("shape",), "triangle": ("prim",), "element": ("element",)}
+# Pixels of the display window outside the data window are empty: of these channels, that is not 0.
+_EMPTY = {"N": 1, **{f"{prefix}{name}": NOTHING for prefix in ("", _OF_PROBE) for name in ("shape", "prim", "element")}}
+_GIT_LFS = b"version https://git-lfs"
 _MAGIC = b"\x76\x2f\x31\x01"
 _quieting = threading.Lock()
 
@@ -42,14 +47,14 @@ class Estimate:
     and a renderer needs to output images only.
     """
 
-    mean: NDArray[np.float64]  # (height, width, 3)
-    variance: NDArray[np.float64]  # (height, width, 3): of one sample; zero if there is one batch only
+    mean: NDArray[np.float64]  # (height, width, channels)
+    variance: NDArray[np.float64]  # (height, width, channels): of one sample; zero if there is one batch only
     count: NDArray[np.int64]  # (height, width): samples of each pixel
     batches: int
 
     @classmethod
     def of_batch(cls, pixels: NDArray[np.floating], samples: int) -> Estimate:
-        """Estimate from one batch, an image ``(height, width, 3)``."""
+        """Estimate from one batch, an image ``(height, width, channels)``."""
         mean = np.asarray(pixels, dtype=np.float64)
         return cls(mean, np.zeros_like(mean), np.full(mean.shape[:2], samples, dtype=np.int64), 1)
 
@@ -109,41 +114,69 @@ class Probe:
     def channels(self) -> Channels:
         """Channels of an OpenEXR file."""
         fields = {name: np.atleast_3d(getattr(self, name)) for name in _PROBE}
-        return {channel: fields[name][..., i] for name, names in _PROBE.items() for i, channel in enumerate(names)}
+        places = [(name, i, channel) for name, names in _PROBE.items() for i, channel in enumerate(names)]
+        return {f"{_OF_PROBE}{channel}": fields[name][..., i] for name, i, channel in places}
 
-    def describe(self, y: int, x: int) -> str:
-        """Text of the first hit of the ray through a pixel."""
-        if not self.hit[y, x]:
+    def describe(self, y: int, x: int, shapes: Sequence[str] = ()) -> str:
+        """Text of the first hit of the ray through a pixel, by the ids of the scene's shapes, if these are known."""
+        shape = int(self.shape[y, x])
+        if shape == NOTHING:
             return "its ray hits nothing"
         u, v = self.uv[y, x]
         element = "" if self.element[y, x] == NOTHING else f"element {self.element[y, x]}, "
-        return f"{element}triangle {self.triangle[y, x]} of shape {self.shape[y, x]}, (u, v) = ({u:.4f}, {v:.4f})"
+        name = f'"{shapes[shape]}"' if shape < len(shapes) and shapes[shape] else shape
+        return f"{element}triangle {self.triangle[y, x]} of shape {name}, (u, v) = ({u:.4f}, {v:.4f})"
 
 
 @dataclass(frozen=True, eq=False)
 class Image:
-    """A linear RGB image, and the further data of its file."""
+    """A linear image, and the further data of its file."""
 
     name: str  # For messages: the path of the file, in most cases
-    pixels: NDArray[np.float64]  # (height, width, 3)
+    pixels: NDArray[np.float64]  # (height, width, channels), of the display window; R, G and B come first
     estimate: Estimate | None = None  # Variance and number of samples; its mean is `pixels`
-    # (height, width, 3): the first batch alone, whose samples a later render of the same scene repeats one by one
+    # As `pixels`: the first batch alone, whose samples a later render of the same scene repeats one by one
     paired: NDArray[np.float64] | None = None
     probe: Probe | None = None
     metadata: dict[str, Any] = field(default_factory=dict)  # How the image was made
+    names: tuple[str, ...] = RGB  # Of the channels
+    # First column and row of the display window of a file, and which of its pixels have data; None for all.
+    origin: tuple[int, int] = (0, 0)
+    has_data: NDArray[np.bool_] | None = None
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height."""
         return self.pixels.shape[1], self.pixels.shape[0]
 
+    def seen_with(self, other: Image) -> NDArray[np.bool_]:
+        """Pixels of which one of two images has data; all if none has, as where one was made without a file."""
+        every = np.ones(self.pixels.shape[:2], dtype=bool)
+        if self.has_data is None or other.has_data is None:
+            return every
+        seen = self.has_data | other.has_data
+        return seen if seen.any() else every
+
+    @property
+    def rgb(self) -> NDArray[np.float64]:
+        """R, G and B of each pixel."""
+        return self.pixels[..., :3]
+
+    def with_channels(self, names: tuple[str, ...]) -> Image:
+        """The image with some of its channels only."""
+        at, estimate = [self.names.index(name) for name in names], self.estimate
+        if estimate is not None:
+            estimate = replace(estimate, mean=estimate.mean[..., at], variance=estimate.variance[..., at])
+        paired = None if self.paired is None else self.paired[..., at]
+        return replace(self, pixels=self.pixels[..., at], estimate=estimate, paired=paired, names=names)
+
     def channels(self) -> Channels:
         """Channels of an OpenEXR file, in single precision."""
-        channels = _rgb_channels("", self.pixels)
+        channels = _named("", self.pixels, self.names)
         if self.estimate is not None:
-            channels |= _rgb_channels("variance.", self.estimate.variance) | {"N": self.estimate.count}
+            channels |= _named("variance.", self.estimate.variance, self.names) | {"N": self.estimate.count}
         if self.paired is not None:
-            channels |= _rgb_channels("paired.", self.paired)
+            channels |= _named("paired.", self.paired, self.names)
         return channels | (self.probe.channels() if self.probe is not None else {})
 
     def not_finite(self) -> tuple[str, tuple[int, int]] | None:
@@ -161,8 +194,7 @@ class Image:
 
 def require_finite(image: Image) -> None:
     """Raise RegressionError if an image is not finite: merging would spread that, and no tier can compare it."""
-    broken = image.not_finite()
-    if broken:
+    if broken := image.not_finite():
         raise RegressionError(f'image "{image.name}" is not finite: {broken[0]}')
 
 
@@ -179,111 +211,111 @@ def load_image(path: str | Path) -> Image:
     Raises RegressionError if the file cannot be read, channels are missing, or the number of samples or the variance is
     impossible.
     """
-    channels, metadata = read_channels(path)
+    channels, metadata, origin, has_data = _read(path)
     source = str(path)
-    pixels = _rgb(channels, "", source)
-    if pixels is None:
-        raise RegressionError(
-            f'image "{source}" has no channels R, G, B; found {", ".join(sorted(channels)) or "none"}'
-        )
-    if metadata.get("schema", SCHEMA) != SCHEMA:
-        raise RegressionError(
-            f'image "{source}" has metadata of schema {metadata["schema"]}; this version reads schema {SCHEMA}'
-        )
+    if (schema := metadata.get("schema", SCHEMA)) != SCHEMA:
+        raise RegressionError(f'image "{source}" has metadata of schema {schema}; this version reads schema {SCHEMA}')
     _require_metadata(metadata, source)
-    estimate = _estimate(channels, pixels, metadata, source)
-    return Image(source, pixels, estimate, _rgb(channels, "paired.", source), _probe(channels, source), metadata)
+    probe, of_probe = _probe(channels, source)
+    present = [prefix for prefix in ("variance.", "paired.") if any(name.startswith(prefix) for name in channels)]
+    of_samples = {*of_probe, *(["N"] if present else []), *(n for n in channels if n.startswith(tuple(present)))}
+    # A comes before layers and AOVs.
+    names = (*RGB, *sorted(channels.keys() - of_samples - {*RGB}, key=lambda name: (name != "A", name)))
+    layers = {prefix: _stacked(channels, prefix, names, source) for prefix in ("", *present)}
+    estimate = _estimate(channels, layers, metadata, source) if "variance." in present else None
+    return Image(source, layers[""], estimate, layers.get("paired."), probe, metadata, names, origin, has_data)
 
 
-def _estimate(
-    channels: Channels, pixels: NDArray[np.float64], metadata: dict[str, Any], source: str
-) -> Estimate | None:
-    variance = _rgb(channels, "variance.", source)
-    if variance is None:
-        return None
+def _estimate(channels: Channels, layers: Channels, metadata: dict[str, Any], source: str) -> Estimate:
+    variance = layers["variance."]
     if "N" not in channels:
         raise RegressionError(f'image "{source}" has a variance but no channel N; expected the samples of each pixel')
-    if channels["N"].dtype.kind not in "ui":
-        raise RegressionError(
-            f'channel N of image "{source}" has numbers of type {channels["N"].dtype}; expected integers'
-        )
+    kind = channels["N"].dtype
+    if kind.kind not in "ui":
+        raise RegressionError(f'channel N of image "{source}" has numbers of type {kind}; expected integers')
     count = channels["N"].astype(np.int64)
     if count.min() < 1:
         raise RegressionError(f'image "{source}" has pixels without samples (channel N is 0); expected at least 1 each')
-    if (variance < 0).any():
+    if variance.min() < 0:
         raise RegressionError(f'image "{source}" has a variance of {variance.min():g}; expected at least 0')
     ranges = metadata.get("sampling", {}).get("batches")
     # A file of another program records no batches: each sample then counts as a batch.
     batches = sum(end - start for start, end in ranges) if ranges else int(count.max())
-    return Estimate(pixels, variance, count, batches)
+    return Estimate(layers[""], variance, count, batches)
 
 
-def _has_all(channels: Channels, names: Sequence[str], source: str, what: str) -> bool:
-    """Whether a file has all channels of some names, or none of them. Raises RegressionError if it lacks some."""
-    missing = [name for name in names if name not in channels]
-    if missing and len(missing) < len(names):
-        raise RegressionError(f'image "{source}" has {what} {", ".join(missing)}; expected {", ".join(names)}')
-    return not missing
+def _probe(channels: Channels, source: str) -> tuple[Probe | None, set[str]]:
+    """The probe, and the names of its channels. Those without a prefix are AOVs unless all are there."""
+    plain = {channel for names in _PROBE.values() for channel in names}
+    prefix = "" if plain <= channels.keys() else _OF_PROBE
+    expected = {f"{prefix}{channel}" for channel in plain}
+    missing = expected - channels.keys()
+    if missing == expected:
+        return None, set()
+    if missing:
+        raise RegressionError(f'image "{source}" has a geometry probe without {", ".join(sorted(missing))}')
+    fields = {name: np.dstack([channels[f"{prefix}{n}"] for n in names]) for name, names in _PROBE.items()}
+    made = {name: values[..., 0] if values.shape[2] == 1 else values for name, values in fields.items()}
+    return Probe(**made), expected
 
 
-def _probe(channels: Channels, source: str) -> Probe | None:
-    expected = [channel for names in _PROBE.values() for channel in names]
-    if not _has_all(channels, expected, source, "a geometry probe without"):
-        return None
-    fields = {name: np.stack([channels[channel] for channel in names], axis=-1) for name, names in _PROBE.items()}
-    return Probe(**{name: values[..., 0] if values.shape[2] == 1 else values for name, values in fields.items()})
+def _named(prefix: str, values: NDArray[np.floating], names: Sequence[str] = RGB) -> Channels:
+    return {f"{prefix}{name}": values[..., i].astype(np.float32) for i, name in enumerate(names)}
 
 
-def _rgb_channels(prefix: str, values: NDArray[np.floating]) -> Channels:
-    return {f"{prefix}{name}": values[..., i].astype(np.float32) for i, name in enumerate(_RGB)}
-
-
-def _rgb(channels: Channels, prefix: str, source: str) -> NDArray[np.float64] | None:
-    names = [f"{prefix}{name}" for name in _RGB]
-    if not _has_all(channels, names, source, "no channel"):
-        return None
-    return np.stack([channels[name] for name in names], axis=-1).astype(np.float64)
+def _stacked(channels: Channels, prefix: str, names: Sequence[str], source: str) -> NDArray[np.float64]:
+    expected = [f"{prefix}{name}" for name in names]
+    missing = [name for name in expected if name not in channels]
+    if missing:
+        raise RegressionError(f'image "{source}" has no channel {", ".join(missing)}; expected {", ".join(expected)}')
+    return np.stack([channels[name] for name in expected], axis=-1).astype(np.float64)
 
 
 def _require_metadata(metadata: dict[str, Any], source: str) -> None:
     """Refuse metadata of another form than `save_image` writes. Any entry may be missing."""
 
-    def are_texts(value: Any) -> bool:
-        return isinstance(value, dict) and all(isinstance(text, str) for text in value.values())
+    def all_are_texts(value: Any, kind: type) -> bool:
+        values = value.values() if isinstance(value, dict) else value
+        return isinstance(value, kind) and all(isinstance(text, str) for text in values)
 
     def has_integers(value: Any, **least: int) -> bool:
         return isinstance(value, dict) and all(type(value.get(k)) is int and value[k] >= n for k, n in least.items())
 
     def is_sampling(value: Any) -> bool:
-        ranges = value.get("batches") if has_integers(value, seed=0, batch=1) else None
-        if not isinstance(ranges, list) or not all(isinstance(pair, list) and len(pair) == 2 for pair in ranges):
+        if not has_integers(value, seed=0, batch=1):
             return False
-        ends = [end for pair in ranges for end in pair]
-        if not (ends and all(type(end) is int and end >= 0 for end in ends) and ends == sorted(ends)):
+        try:
+            ends = [end for start, stop in value["batches"] for end in (start, stop)]
+        except (KeyError, TypeError, ValueError):
+            return False
+        if not ends or any(type(end) is not int for end in ends) or [0, *ends] != sorted([0, *ends]):
+            return False
+        if any(start == stop for start, stop in value["batches"]):
             return False
         # Files of older versions have neither of these.
         counts = {"total": ends[-1], "passes": 1, **value}
-        is_whole = has_integers(counts, total=ends[-1], passes=1) and counts["passes"] <= counts["total"]
-        return is_whole and all(start < end for start, end in ranges)
+        return has_integers(counts, total=ends[-1], passes=1) and counts["passes"] <= counts["total"]
 
     forms = {
         "sampling": (is_sampling, "a seed, the samples of a batch, and ranges of batches"),
         "paired": (lambda value: has_integers(value, seed=0, spp=1), "a seed and samples per pixel"),
-        **dict.fromkeys(("variant", "filter"), (lambda value: isinstance(value, str), "a name")),
-        "files": (are_texts, "checksums by name"),
-        "parameters": (are_texts, "values by name"),
-        "environment": (are_texts, "versions by name"),
+        **dict.fromkeys(("variant", "filter", "sampler"), (lambda value: isinstance(value, str), "a name")),
+        **dict.fromkeys(("channels", "shapes"), (lambda value: all_are_texts(value, list), "a list of names")),
+        "sensor": (lambda value: has_integers({"sensor": value}, sensor=0), "a number from 0 on"),
         "tolerances": (lambda value: isinstance(value, dict), "numbers by name"),
     }
+    for name, what in {"files": "checksums", "parameters": "values", "environment": "versions"}.items():
+        forms[name] = (lambda value: all_are_texts(value, dict), f"{what} by name")
     for name, (is_right, expected) in forms.items():
         if name in metadata and not is_right(metadata[name]):
-            given = str(metadata[name])
-            raise RegressionError(f'metadata of image "{source}": {name} is {given:.60}; expected {expected}')
+            raise RegressionError(
+                f'metadata of image "{source}": {name} is {metadata[name]!s:.60}; expected {expected}'
+            )
 
 
 def write_exr(path: str | Path, pixels: NDArray[np.floating], metadata: dict | None = None) -> None:
     """Write linear RGB pixels ``(height, width, 3)``, as `write_channels` does."""
-    write_channels(path, _rgb_channels("", pixels), metadata)
+    write_channels(path, _named("", pixels), metadata)
 
 
 def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: dict | None = None) -> None:
@@ -295,10 +327,8 @@ def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: 
     Integers become 32 bits unsigned, all else float32; a dot in a name makes a layer: ``variance.R``. Metadata are kept
     as JSON, in the string attribute `METADATA_ATTRIBUTE`.
     """
-    converted = {
-        name: np.ascontiguousarray(values, dtype=np.uint32 if values.dtype.kind in "iu" else np.float32)
-        for name, values in channels.items()
-    }
+    kinds = {name: np.uint32 if values.dtype.kind in "iu" else np.float32 for name, values in channels.items()}
+    converted = {name: np.ascontiguousarray(values, dtype=kinds[name]) for name, values in channels.items()}
     header: dict[str, Any] = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     if metadata:
         # JSON, as OpenEXR would round Python's numbers to 32 bits.
@@ -310,9 +340,16 @@ def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: 
 def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
     """Channels ``(height, width)`` by name of a file of one part, and its metadata, empty if there is none.
 
+    They show the display window, and are empty outside the data window: 0, and no shape.
+
     Raises RegressionError if there is no such file, it is truncated or not an OpenEXR file, or it has several parts,
     deep pixels or broken metadata.
     """
+    return _read(path)[:2]
+
+
+def _read(path: str | Path) -> tuple[Channels, dict[str, Any], tuple[int, int], NDArray[np.bool_]]:
+    """`read_channels`, the first column and row of the display window, and which of its pixels have data."""
     path = Path(path)
     if not path.is_file():
         raise RegressionError(f'image "{path}" is not a file; expected an OpenEXR file')
@@ -326,12 +363,15 @@ def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
         parts = 0
     if not parts:
         with path.open("rb") as start:
-            is_exr = start.read(len(_MAGIC)) == _MAGIC
+            begin = start.read(len(_GIT_LFS))
+        is_exr = begin.startswith(_MAGIC)
+        if begin == _GIT_LFS:
+            raise ContentElsewhere(
+                f'image "{path}" is a pointer of git-lfs without its pixels; get them by: git lfs pull'
+            )
         raise RegressionError(f'image "{path}" {"is truncated, or damaged" if is_exr else "is not an OpenEXR file"}')
     if parts > 1:
-        raise RegressionError(
-            f'image "{path}" has {parts} parts; expected 1, as most programs read only the first part'
-        )
+        raise RegressionError(f'image "{path}" has {parts} parts; expected 1, as most programs read only the first')
     if any(values.dtype == object or values.ndim != 2 for values in channels.values()):
         raise RegressionError(f'image "{path}" has deep or subsampled channels; expected one value per pixel')
     try:
@@ -340,7 +380,17 @@ def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
         raise RegressionError(f'attribute "{METADATA_ATTRIBUTE}" of image "{path}" is not JSON: {error}') from None
     if not isinstance(metadata, dict):
         raise RegressionError(f'attribute "{METADATA_ATTRIBUTE}" of image "{path}" is no JSON object')
-    return channels, metadata
+    (start, stop), (first, last) = (np.asarray(header[name]) for name in ("displayWindow", "dataWindow"))
+    has_data = np.zeros((stop - start + 1)[::-1], dtype=bool)
+    # Columns and rows that both windows have, in each of them.
+    low, high = np.maximum(start, first), np.maximum(np.minimum(stop, last) + 1, np.maximum(start, first))
+    of_display, of_data = (tuple(map(slice, (low - at)[::-1], (high - at)[::-1])) for at in (start, first))
+    has_data[of_display] = True
+    if not (has_data.all() and (first == start).all() and (last == stop).all()):
+        for name, values in channels.items():
+            channels[name] = np.full(has_data.shape, _EMPTY.get(name, 0), dtype=values.dtype)
+            channels[name][of_display] = values[of_data]
+    return channels, metadata, (int(start[0]), int(start[1])), has_data
 
 
 @contextmanager

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 PAGE, NUMBERS, MAPS = "index.html", "comparison.json", "maps.exr"
+# Panels of channels besides R, G and B.
+MOST_OTHERS = 4
 COLUMNS, PANEL_INCHES, DOTS_PER_INCH = 4, 2.9, 160
 # Degrees that the first and the last colour stand for.
 ANGLES = (1e-5, 10.0)
@@ -34,13 +36,7 @@ _MAPS = {
     "relative": ("Relative difference", "(test - reference) / reference,\nmean of R, G, B", _SIGNED, 0.01, 99.0),
     "paired": ("Paired difference", "from the same samples, so\nwithout noise", _SIGNED, 0.01, 99.0),
     "z": ("z-score", "over the standard error, strongest\nchannel; failing tiles outlined", _SIGNED, 5.0, 99.9),
-    "evidence": (
-        "Evidence against noise",
-        "$-\\log_{10} p$ at the most\ntelling size of tiles",
-        "viridis",
-        10.0,
-        100.0,
-    ),
+    "evidence": ("Evidence against noise", "$-\\log_{10} p$ at the most\ntelling tiles", "viridis", 10.0, 100.0),
     "flip": ("FLIP", "HDR-FLIP error", "magma", 0.05, 100.0),
     "angle": ("Angle between normals", "degrees; grey at silhouettes\nand where nothing is hit", "magma", 0.0, 100.0),
 }
@@ -93,8 +89,8 @@ def _panels(comparison: Comparison) -> bytes:
         from matplotlib.figure import Figure
     except ImportError:
         raise RegressionError("reports need matplotlib: pip install 'mitsuba-subdivision[figures]'") from None
-    a, b = comparison.reference.pixels, comparison.test.pixels
-    finite = bool(np.isfinite(a).all() and np.isfinite(b).all())
+    a, b = comparison.reference.rgb, comparison.test.rgb
+    finite = bool(np.isfinite(comparison.reference.pixels).all() and np.isfinite(comparison.test.pixels).all())
     maps = {"relative": relative_difference(a, b), **_maps(comparison)} if finite else {}
     count = 2 + len(maps)
     rows, columns = -(-count // COLUMNS), min(COLUMNS, count)
@@ -125,7 +121,11 @@ def _maps(comparison: Comparison) -> dict[str, NDArray[np.floating]]:
     if "flip" not in maps:
         with suppress(RegressionError):
             maps |= compare_flip(comparison.reference, comparison.test, comparison.tolerances).maps
-    return maps
+    reference, test = comparison.reference, comparison.test
+    others = {name: test.pixels[..., i] - reference.pixels[..., i] for i, name in enumerate(reference.names) if i > 2}
+    # Alpha, and those that differ most.
+    order = sorted(others, key=lambda name: (name != "A", -np.abs(others[name]).mean()))
+    return maps | {f"difference of {name}": others[name] for name in order[:MOST_OTHERS]}
 
 
 def _draw_map(panel: Axes, comparison: Comparison, name: str, values: NDArray[np.floating]) -> None:
@@ -135,7 +135,9 @@ def _draw_map(panel: Axes, comparison: Comparison, name: str, values: NDArray[np
     from matplotlib.patches import Rectangle
     from matplotlib.ticker import MaxNLocator
 
-    title, caption, colours, least, percentile = _MAPS[name]
+    # Alpha, layers and AOVs are in units of their own.
+    other = (name[:1].upper() + name[1:], "test - reference", _SIGNED, 1e-6, 99.9)
+    title, caption, colours, least, percentile = _MAPS.get(name, other)
     if name == "angle":
         norm: Normalize = LogNorm(*ANGLES)
         values = np.maximum(values, ANGLES[0])
@@ -144,9 +146,8 @@ def _draw_map(panel: Axes, comparison: Comparison, name: str, values: NDArray[np
         norm = Normalize(-reach if colours == _SIGNED else 0, reach)
     colour_map = matplotlib.colormaps[colours].with_extremes(bad="0.55")
     picture = panel.imshow(np.ma.masked_invalid(values), colour_map, norm, interpolation="nearest")
-    bar = panel.figure.colorbar(
-        picture, ax=panel, location="bottom", shrink=0.9, aspect=30, pad=0.02, panchor=(0.5, 1.0)
-    )
+    place: dict[str, Any] = {"location": "bottom", "shrink": 0.9, "aspect": 30, "pad": 0.02, "panchor": (0.5, 1.0)}
+    bar = panel.figure.colorbar(picture, ax=panel, **place)
     bar.ax.tick_params(labelsize=7.5)
     if name != "angle":
         bar.locator = MaxNLocator(5)
@@ -196,7 +197,7 @@ def _page(title: str, comparison: Comparison, picture: bytes) -> str:
 def _how_made(comparison: Comparison) -> str:
     rows = []
     for role, image in (("reference", comparison.reference), ("test", comparison.test)):
-        for key in ("variant", "filter", "sampling", "environment", "command"):
+        for key in ("variant", "filter", "sampler", "sensor", "sampling", "environment", "command"):
             if key in image.metadata:
                 value: Any = image.metadata[key]
                 text = value if isinstance(value, str) else json.dumps(value)

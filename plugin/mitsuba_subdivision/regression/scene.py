@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import hashlib
 import os
-import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Union
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
-from ..llvm import loaded_version
 from ..messages import timed
 from . import RegressionError
 
@@ -52,6 +48,25 @@ class LoadedScene:
         return self.scene.sensors()[self.sensor_index]
 
     @property
+    def sampler(self) -> str:
+        """Kind and options of the sampler, without its number of samples."""
+        kind, *options = str(self.sensor.sampler()).replace("[", "\n").splitlines()
+        kept = [option.strip(" ,]") for option in options if "sample_count" not in option]
+        return " ".join([kind.strip(), *filter(None, kept)])
+
+    def channel_names(self, count: int) -> tuple[str, ...]:
+        """Names of as many channels as an image of the scene has: R, G, B, A and AOVs."""
+        has_alpha = int(self.sensor.film().flags()) & int(mi.FilmFlags.Alpha)
+        colours, others = ["R", "G", "B", "A"][: 4 if has_alpha else 3], list(self.scene.integrator().aov_names())
+        nested = [name.removesuffix(".A") for name in others if name.endswith(".A")]
+        # Integrators within one of AOVs have channels of their own; those of the first are the film's.
+        if nested and len(colours) + len(others) != count:
+            absent = {f"{nested[0]}.{name}" for name in "RGBA"} | {f"{name}.A" for name in nested if not has_alpha}
+            others = [name for name in others if name not in absent]
+        names = (*colours, *others)
+        return names if len(names) == count else tuple([*"RGBA", *map(str, range(4, count))][:count])
+
+    @property
     def file_paths(self) -> list[Path]:
         """The scene's file, and all files that the scene names."""
         return [self.path.resolve().parent / name for name in self.files] if self.path else []
@@ -84,17 +99,18 @@ def load_scene(
     scene, files = (source, {}) if isinstance(source, mi.Scene) else _parsed_scene(source, given, filter_name)
     if not isinstance(scene, mi.Scene) or not scene.sensors():
         raise RegressionError(f'"{path or "dictionary"}" is no scene with a sensor; expected one to render')
-    # By the class that the filter prints: "BoxFilter[]" is "box".
-    filter_of_scene = str(scene.sensors()[0].film().rfilter()).partition("[")[0].removesuffix("Filter").lower()
     count = len(scene.sensors())
+    if not 0 <= sensor_index < count:
+        sensors = "one sensor, 0" if count == 1 else f"sensors 0 to {count - 1}"
+        raise RegressionError(f"there is no sensor {sensor_index}; the scene has {sensors}")
+    # By the class that the filter prints: "BoxFilter[]" is "box".
+    film = scene.sensors()[sensor_index].film()
+    filter_of_scene = str(film.rfilter()).partition("[")[0].removesuffix("Filter").lower()
     if isinstance(source, mi.Scene) and filter_name not in (None, filter_of_scene):
         raise RegressionError(
             f'the loaded scene has the reconstruction filter "{filter_of_scene}"; expected "{filter_name}", which '
             "a scene given as a file or a dictionary gets"
         )
-    if not 0 <= sensor_index < count:
-        sensors = "one sensor, 0" if count == 1 else f"sensors 0 to {count - 1}"
-        raise RegressionError(f"there is no sensor {sensor_index}; the scene has {sensors}")
     return LoadedScene(scene, path, filter_of_scene, files, given, sensor_index)
 
 
@@ -210,32 +226,3 @@ def parts_of(spp: int, size: tuple[int, int]) -> list[int]:
     """Samples per pixel of the parts of an image of this width and height; they differ by one at most."""
     count = max(1, spp // max(LEAST_PART_SPP, PART_SAMPLES // (size[0] * size[1])))
     return [(i + 1) * spp // count - i * spp // count for i in range(count)]
-
-
-# Fields that distinguish processors of one name on x86, and that identify those of ARM, which have no name.
-_NUMBERS = ("cpu family", "model", "CPU implementer", "CPU architecture", "CPU variant", "CPU part")
-
-
-def environment(variant: str) -> dict[str, str]:
-    """Versions of libraries, and the processor, that renders in a variant depend on."""
-    # Not of this package: its changes are what the tests are for.
-    modules = {"mitsuba": mi, "drjit": dr, "numpy": np, "scipy": scipy}
-    versions = {name: module.__version__ for name, module in modules.items()} | {"processor": _processor()}
-    if variant.startswith("llvm"):
-        versions["llvm"] = str(loaded_version())
-    return versions
-
-
-def _processor() -> str:
-    # Code for another processor may add in another order. On Linux, `platform` does not know the model.
-    information = Path("/proc/cpuinfo")
-    name = _first_of(information.read_text(encoding="utf-8", errors="replace")) if information.is_file() else ""
-    return name or platform.processor() or platform.machine()
-
-
-def _first_of(information: str) -> str:
-    """The first processor of Linux's list, by its name and numbers: generations share names such as "AMD EPYC"."""
-    lines = [line.split(":", 1) for line in information.split("\n\n", 1)[0].splitlines() if ":" in line]
-    values = {name.strip(): value.strip() for name, value in lines}
-    names = ["model name", *_NUMBERS]
-    return ", ".join(f"{name} {values[name]}".removeprefix("model name ") for name in names if name in values)

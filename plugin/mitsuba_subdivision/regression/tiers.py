@@ -31,17 +31,22 @@ DEFAULT_TIERS = ("probe", "paired", "tile")
 
 # The difference of a pixel that is darker than this part of the image's mean is taken relative to that part.
 DARK = 1e-3
-# Both images drew the same samples if these agree.
-_SAME_SAMPLES = ("variant", "filter", "paired")
+# Both images drew the same samples if these agree. References of older versions lack the last two.
+_SAME_SAMPLES, _IF_KNOWN = ("variant", "filter", "paired"), ("sampler", "sensor")
 
 # Sides of the square tiles in pixels; None is the whole image. Small tiles find dents, large ones a change of colour.
 SCALES: tuple[int | None, ...] = (4, 8, 16, None)
 # Samples that a reference should have for each of the test's, so that its own noise hardly counts.
 REFERENCE_SAMPLES = 16
-# Events of a kind that a reference may miss by chance: it misses three expected ones in 5 % of all cases.
-MISSED_EVENTS = 3.0
-# Below it, the deviance is that of the normal distribution to one part in 10^5.
-_SMALL_EXCESS = 1e-5
+# Side of the tiles that tell how much noisier the test is than the reference.
+NOISE_TILE = 4
+# Mitsuba's spectra of a colour miss it by up to this part of its largest value; measured for 18 colours.
+SPECTRA = 5e-4
+# Part of the variance that images with all samples in common keep at least. If all noise of a pixel is that of a single
+# bright path, and rounding sends it elsewhere, then the difference is 1 / sqrt(0.1) = 3.2 standard errors.
+LEAST_NOISE = 0.1
+# More degrees of freedom make no difference.
+_MOST_FREEDOM = 1e12
 
 # What FLIP's tone curve, ACES, maps to 0.85, the value that limits its exposures; and weights of R, G and B.
 _BRIGHT = 2.118872324
@@ -118,8 +123,7 @@ class Tolerances:
 
 def pixel_of_largest(values: NDArray[np.floating]) -> tuple[int, int]:
     """Row and column of the largest value of a map ``(height, width)``."""
-    row, column = np.unravel_index(np.argmax(values), values.shape)
-    return int(row), int(column)
+    return divmod(int(np.argmax(values)), values.shape[1])
 
 
 def _skipped(name: str, reason: str) -> TierResult:
@@ -220,11 +224,11 @@ def compare_paired(reference: Image, test: Image, tolerances: Tolerances) -> Tie
     reason = _different_samples(reference, test)
     if reason:
         return _skipped("paired", reason)
-    difference = np.abs(test.paired - reference.paired)
-    size = np.maximum(np.abs(reference.paired), DARK * np.abs(reference.paired).mean())
-    relative = difference / np.where(size > 0, size, 1)
+    difference = test.paired - reference.paired
+    size = np.maximum(np.abs(reference.paired), DARK * levels(reference.paired))
+    relative = np.abs(difference) / np.where(size > 0, size, 1)
     largest = float(relative.max())
-    changed = int((difference.max(axis=2) > 0).sum())
+    changed = int(difference.any(axis=2).sum())
     numbers = {"paired_relative": largest, "changed_pixels": changed, "pixels": int(difference[..., 0].size)}
     maps = {"paired": relative_difference(reference.paired, test.paired)}
     if largest <= tolerances.paired_relative:
@@ -235,25 +239,50 @@ def compare_paired(reference: Image, test: Image, tolerances: Tolerances) -> Tie
         f"at most {tolerances.paired_relative:.2g} expected"
     )
     result = TierResult("paired", Status.FAIL, [line], numbers, pixel_of_largest(relative.max(axis=2)), maps)
-    environment = _differences(reference.metadata.get("environment", {}), test.metadata.get("environment", {}))
-    if environment:
+    doubts = _differences(reference.metadata.get("environment", {}), test.metadata.get("environment", {}))
+    if reference.metadata.get("files") != test.metadata.get("files") and "sampler" not in reference.metadata:
+        doubts.append("the reference, of an older version, does not say with which sampler")
+    if doubts:
         result.status = Status.WARN
-        result.lines.append(f"which may come from the environment: {'; '.join(environment)}")
+        result.lines.append(f"which may come from the environment: {'; '.join(doubts)}")
+    return result
+
+
+def _noise_left(reference: Image, test: Image, estimate: Estimate) -> float:
+    """Part of both images' variance that their difference has: 1, or less if they have all samples in common.
+
+    Rounding then sends a few paths elsewhere. How many, the first batches tell.
+    """
+    records = [image.metadata.get("sampling", {}) for image in (reference, test)]
+    a, b = ([record.get(key) for key in ("seed", "batch", "batches")] for record in records)
+    if None in a or a != b or reference.paired is None or test.paired is None or _different_samples(reference, test):
+        return 1.0
+    squares = (test.paired - reference.paired) ** 2
+    total = 2 * estimate.variance / test.metadata["paired"]["spp"]
+    return min(1.0, max(LEAST_NOISE, float(squares.sum() / max(total.sum(), 1e-30))))
+
+
+def levels(pixels: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Mean sizes of the channels' values ``(channels,)``; R, G and B have one in common."""
+    result = np.abs(pixels).mean(axis=(0, 1))
+    result[:3] = result[:3].mean()
     return result
 
 
 def relative_difference(reference: NDArray[np.floating], test: NDArray[np.floating]) -> NDArray[np.floating]:
     """Map of the relative difference between two images, in the mean of R, G and B; less so where it is dark."""
+    reference, test = reference[..., :3], test[..., :3]
     grey = 0.01 * np.abs(reference).mean() + 1e-12
     return (test.mean(axis=2) - reference.mean(axis=2)) / (np.abs(reference).mean(axis=2) + grey)
 
 
 def _different_samples(reference: Image, test: Image) -> str | None:
     """Why the samples of two images are not the same, None if they are."""
-    for image, role in ((reference, "reference"), (test, "test")):
-        if "paired" not in image.metadata:
-            return f"the {role} does not say with which seed its first batch was rendered"
-    wanted, given = ({key: image.metadata.get(key) for key in _SAME_SAMPLES} for image in (reference, test))
+    silent = [role for role, image in (("reference", reference), ("test", test)) if "paired" not in image.metadata]
+    if silent:
+        return f"the {silent[0]} does not say with which seed its first batch was rendered"
+    keys = [*_SAME_SAMPLES, *(key for key in _IF_KNOWN if key in reference.metadata and key in test.metadata)]
+    wanted, given = ({key: image.metadata.get(key) for key in keys} for image in (reference, test))
     different = _differences(wanted, given)
     if different:
         return f"the samples are not the same: {'; '.join(different)}"
@@ -280,14 +309,13 @@ def _in_words(value: Any) -> str:
 def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_size: int = 1) -> TierResult:
     """Test each tile for whether noise alone explains its difference: two-sided tests, at several scales.
 
-    A tile's difference is the sum of many small contributions, and of a few large ones where bright paths are rare. The
-    small ones are normally distributed, with the variance that the reference measures. The large ones are rare events,
-    whose number is Poisson distributed: a single one in the test may lie many standard errors from the mean. The
-    variance between the test's batches tells them: k events where the reference expects l raise the variance k / l
-    times, but a change of the scene raises it little. `_z_scores` has the formulas.
+    Each image's noise is its own, as its batches measure it. But a test of few samples may have missed a tile's rare
+    bright paths, and shows no noise then; so its noise is at least what the reference expects of as many samples. Of
+    images that have their samples in common, the noise is what rounding leaves. `_z_scores` has the formulas.
 
-    Single precision adds a bias: the standard error has a floor for that. Šidák's correction covers the tiles and
-    channels of a scale, Bonferroni's the scales and the scenes of a suite, of which there are ``suite_size``.
+    Single precision adds a bias, and so do spectra of colours: the standard error has a floor for that. Šidák's
+    correction covers the tiles and channels of a scale, Bonferroni's the scales and the scenes of a suite, of which
+    there are ``suite_size``.
     """
     expected, tested = reference.estimate, test.estimate
     if expected is None or tested is None:
@@ -298,13 +326,24 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
     # Of `scipy.stats`, which has names for these, the import takes a second.
     from scipy.special import log_ndtr, ndtr
 
+    left = _noise_left(reference, test, expected)
+    expected, tested = (replace(estimate, variance=left * estimate.variance) for estimate in (expected, tested))
+    sides = SCALES if left == 1 else (1, *SCALES)
     height, width, _ = expected.mean.shape
     scales, failing, evidence = {}, [], {}
-    for scale in SCALES:
+    floor = tolerances.floor_relative * np.abs(expected.mean) + tolerances.floor_absolute
+    are_spectral = {"spectral" in image.metadata.get("variant", "") for image in (reference, test)}
+    if len(are_spectral) > 1:
+        floor[..., :3] += SPECTRA * np.abs(reference.rgb).max(axis=2, keepdims=True)
+    # Where the test is noisier in most tiles, it is so in those that missed rare paths.
+    own, others = (_tile_sums(estimate.variance, NOISE_TILE) for estimate in (tested, expected))
+    noisier = np.median(own[others > 0] / others[others > 0]) if others.any() else 1
+    least = max(1.0, float(noisier)) * expected.variance
+    for scale in sides:
         side = scale or max(height, width)
-        z = _z_scores(expected, tested, side, tolerances)
+        z = _z_scores(expected, tested, least, floor, side)
         p = 2 * ndtr(-np.abs(z))
-        limit = float(-np.expm1(np.log1p(-tolerances.alpha / (len(SCALES) * suite_size)) / z.size))
+        limit = float(-np.expm1(np.log1p(-tolerances.alpha / (len(sides) * suite_size)) / z.size))
         places = np.argwhere(p < limit)
         scales[str(scale or "whole")] = {
             "smallest_p": float(p.min()),
@@ -316,15 +355,15 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
         for row, column, channel in places:
             x, y = side * int(column), side * int(row)
             place = {"x": x, "y": y, "width": min(side, width - x), "height": min(side, height - y)}
-            failing.append({**place, "channel": "RGB"[channel], "z": float(z[row, column, channel])})
+            failing.append({**place, "channel": reference.names[channel], "z": float(z[row, column, channel])})
         if scale:
             smallest = (log_ndtr(-np.abs(z)).min(axis=2) + np.log(2)) / -np.log(10)
             evidence[p.min() / limit] = np.repeat(np.repeat(smallest, side, axis=0), side, axis=1)[:height, :width]
 
-    pixel_z = _z_scores(expected, tested, 1, tolerances)
+    pixel_z = _z_scores(expected, tested, least, floor, 1)
     strongest = np.take_along_axis(pixel_z, np.abs(pixel_z).argmax(axis=2, keepdims=True), axis=2)[..., 0]
     spp, reference_spp = (int(np.median(estimate.count)) for estimate in (tested, expected))
-    samples = f"{spp} samples per pixel against {reference_spp}"
+    samples = f"{spp} samples per pixel against {reference_spp}{'' if left == 1 else ', the same ones'}"
     result = TierResult(
         "tile",
         Status.FAIL if failing else Status.PASS,
@@ -334,56 +373,49 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
         maps={"z": strongest, "evidence": evidence[min(evidence)]},
     )
     if failing:
-        counts = ", ".join(
-            f"{scale['failing']} of {scale['tests']} at {'full size' if name == 'whole' else f'{name} x {name}'}"
-            for name, scale in scales.items()
-            if scale["failing"]
-        )
+        sizes = {name: "full size" if name == "whole" else f"{name} x {name}" for name in scales}
+        counts = [f"{s['failing']} of {s['tests']} at {sizes[name]}" for name, s in scales.items() if s["failing"]]
         clearest = max(failing, key=lambda tile: abs(tile["z"]))
-        result.lines = [
-            f"not noise ({samples}); tests that fail: {counts}",
-            "clearest: {width} x {height} pixels at x = {x}, y = {y}, channel {channel}, z = {z:+.1f}".format(
-                **clearest
-            ),
-        ]
+        where = "clearest: {width} x {height} pixels at x = {x}, y = {y}, channel {channel}, z = {z:+.1f}"
+        result.lines = [f"not noise ({samples}); tests that fail: {', '.join(counts)}", where.format(**clearest)]
+        if len(are_spectral) > 1:
+            result.lines.append("one variant is spectral: light between coloured surfaces differs from that of RGB")
         # The pixel to look at lies in the smallest tile that failed.
         small = min(failing, key=lambda tile: (tile["width"] * tile["height"], -abs(tile["z"])))
         x, y = small["x"], small["y"]
         row, column = pixel_of_largest(np.abs(strongest[y : y + small["height"], x : x + small["width"]]))
         result.worst = (y + row, x + column)
-    if reference_spp < REFERENCE_SAMPLES * spp:
-        result.lines.append(
-            f"the reference has less than {REFERENCE_SAMPLES} times the samples: its own noise hides small changes"
-        )
+    if left == 1 and reference_spp < REFERENCE_SAMPLES * spp:
+        few = f"less than {REFERENCE_SAMPLES} times the samples: its own noise hides small changes"
+        result.lines.append(f"the reference has {few}")
     return result
 
 
-def _z_scores(reference: Estimate, test: Estimate, side: int, tolerances: Tolerances) -> NDArray[np.float64]:
-    """z-scores ``(rows, columns, 3)`` of the tiles of one size, reduced where rare events may explain the difference.
+def _z_scores(
+    reference: Estimate, test: Estimate, least: NDArray[np.floating], floor: NDArray[np.floating], side: int
+) -> NDArray[np.float64]:
+    """z-scores ``(rows, columns, channels)`` of the tiles of one size.
 
-    Let D be the difference of a tile's means, V its variance by the reference, and E what the variance of the test's
-    own mean has in excess of that. If both come of events of one size, that size is M = E / |D|, in units of D: the
-    reference expects V / M^2 of them and the test has D / M more. The deviance of the Poisson distribution then gives
-
-        z = D / sqrt(V) * sqrt(2 ((1 + u) log(1 + u) - u)) / u,    u = E / V,
-
-    which is D / sqrt(V) without an excess. The reference may have missed some: V gets `MISSED_EVENTS` of this size for
-    all its samples. Tiles at the right and lower border may be smaller.
+    Let D be the difference of a tile's means and s^2 its variance, the sum of both sides'. Each is a sum of what its
+    pixels' batches measure, so that D / s has Student's distribution, with the degrees of freedom of [Welch 1947].
+    By [Wallace 1959], it becomes normal. The test has a least variance, and pixels have a least standard error.
     """
     area = _tile_sums(np.ones((*test.count.shape, 1)), side)
+    difference, bias = (_tile_sums(values, side) / area for values in (test.mean - reference.mean, floor))
 
-    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return _tile_sums(values, side) / area
+    def measured(variance: NDArray[np.floating], count: NDArray[np.integer], batches: int) -> NDArray[np.float64]:
+        """Variances of the means of tiles; and their squares over the degrees of freedom."""
+        of_mean = variance / count[..., None]
+        # The square of a variance of n degrees of freedom is expected to be 1 + 2 / n times too large.
+        return np.stack([_tile_sums(of_mean, side) / area**2, _tile_sums(of_mean**2, side) / area**4 / (batches + 1)])
 
-    count, reference_count = test.count[..., None], reference.count[..., None]
-    difference = mean(test.mean - reference.mean)
-    floor = tolerances.floor_relative * np.abs(mean(reference.mean)) + tolerances.floor_absolute
-    variance = mean(reference.variance * (1 / count + 1 / reference_count)) / area + floor**2
-    excess = np.maximum(mean((test.variance - reference.variance) / count) / area, 0)
-    size = excess / np.where(difference == 0, np.inf, np.abs(difference))
-    variance += MISSED_EVENTS * mean(count / reference_count) * size**2
-    u = np.maximum(excess / variance, _SMALL_EXCESS)
-    return difference / np.sqrt(variance) * np.sqrt(2 * ((1 + u) * np.log1p(u) - u)) / u
+    own, expected = measured(test.variance, test.count, test.batches), measured(least, test.count, reference.batches)
+    of_test = np.where(own[0] > expected[0], own, expected)
+    variance, scatter = measured(reference.variance, reference.count, reference.batches) + of_test
+    variance += bias**2
+    freedom = variance**2 / np.maximum(scatter, variance**2 / _MOST_FREEDOM)
+    z = np.sqrt(freedom * np.log1p(difference**2 / variance / freedom)) * (8 * freedom + 1) / (8 * freedom + 3)
+    return np.copysign(z, difference)
 
 
 def _tile_sums(values: NDArray[np.floating], side: int) -> NDArray[np.float64]:
@@ -419,23 +451,38 @@ def compare_flip(reference: Image, test: Image, tolerances: Tolerances) -> TierR
         raise RegressionError("FLIP is not installed: pip install 'mitsuba-subdivision[figures]'") from None
     if not (np.isfinite(reference.pixels).all() and np.isfinite(test.pixels).all()):
         raise RegressionError("FLIP does not see pixels that are not finite; expected finite images")
-    start, stop, count = flip_exposures(reference.pixels)
+    start, stop, count = flip_exposures(reference.rgb)
     # Arrays, since FLIP ends the process at files that it cannot read; nonnegative, since its tone curve has poles.
-    arrays = [np.ascontiguousarray(np.maximum(image.pixels, 0), dtype=np.float32) for image in (reference, test)]
-    errors, _, _ = flip_evaluator.evaluate(
+    arrays = [np.ascontiguousarray(np.maximum(image.rgb, 0), dtype=np.float32) for image in (reference, test)]
+    of_rgb, _, _ = flip_evaluator.evaluate(
         *arrays,
         "HDR",
         applyMagma=False,
         computeMeanError=False,
         parameters={"startExposure": start, "stopExposure": stop, "numExposures": count, "tonemapper": "ACES"},
     )
-    errors = np.asarray(errors, dtype=np.float64)[..., 0]
-    mean, p95 = float(errors.mean()), float(np.percentile(errors, 95))
-    numbers = {"flip_mean": mean, "flip_p95": p95, "exposures": [start, stop, count]}
-    failed = mean > tolerances.flip_mean or p95 > tolerances.flip_p95
-    line = (
-        f"mean {mean:.2g}, 95th percentile {p95:.2g}; "
-        f"at most {tolerances.flip_mean:.2g} and {tolerances.flip_p95:.2g} expected"
-    )
-    worst = pixel_of_largest(errors) if failed else None
-    return TierResult("flip", Status.FAIL if failed else Status.PASS, [line], numbers, worst, {"flip": errors})
+    errors = {"R, G, B": np.asarray(of_rgb, dtype=np.float64)[..., 0], **_errors_of_others(reference, test)}
+    seen = reference.seen_with(test)
+    means = {name: float(values[seen].mean()) for name, values in errors.items()}
+    p95s = {name: float(np.percentile(values[seen], 95)) for name, values in errors.items()}
+    numbers = {"flip_mean": max(means.values()), "flip_p95": max(p95s.values()), "exposures": [start, stop, count]}
+    failed = [name for name in errors if means[name] > tolerances.flip_mean or p95s[name] > tolerances.flip_p95]
+    expected = f"at most {tolerances.flip_mean:.2g} and {tolerances.flip_p95:.2g} expected"
+    lines = [
+        f"{'' if len(errors) == 1 else f'{name}: '}mean {means[name]:.2g}, 95th percentile {p95s[name]:.2g}; {expected}"
+        for name in failed or ["R, G, B"]
+    ]
+    worst = pixel_of_largest(errors[failed[0]] * seen) if failed else None
+    status = Status.FAIL if failed else Status.PASS
+    return TierResult("flip", status, lines, numbers, worst, {"flip": errors["R, G, B"]})
+
+
+def _errors_of_others(reference: Image, test: Image) -> dict[str, NDArray[np.floating]]:
+    """What FLIP does not see: differences of alpha, and relative ones of layers and AOVs, by their names."""
+    errors: dict[str, NDArray[np.floating]] = {}
+    for i, name in enumerate(reference.names[3:], start=3):
+        a, b = np.abs(reference.pixels[..., i]), np.abs(test.pixels[..., i])
+        least = DARK * np.median(a[a > 0]) if a.any() else 1.0
+        size = 1.0 if name.rpartition(".")[2] == "A" else np.maximum(np.maximum(a, b), least)
+        errors[name] = np.abs(test.pixels[..., i] - reference.pixels[..., i]) / size
+    return errors
