@@ -53,7 +53,7 @@ WRITTEN = {
     "README": {"artifact.png", "human.png", "rook.png"},
     "blender": {"mug.blend", "mug.usda", "mug.png", "mug.obj"},
     "comparing-renders": {"valence5.exr", "reference.exr", "index.html", "rook.exr"},
-    "figures": {"creases.png"},
+    "figures": {"creases.png", "whole.png", "inset.png"},
     "files": {"barrel.usda", "human.ply", "barrel.ply"},
     "fitting": {"found.obj", "fit.npz"},
     "python": {"barrel.obj"},

@@ -6,10 +6,12 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage.named_cages import extraordinary
+from mitsuba_subdivision import LimitSurface
+from mitsuba_subdivision.cage import extraordinary
 from mitsuba_subdivision.figures import normal_error
 from mitsuba_subdivision.figures.normal_error import ROWS, normal_errors, surface_of, vertex_normal
 from mitsuba_subdivision.figures.staging import project
+from mitsuba_subdivision.regression.tiers import normal_angle
 
 SCENES = Path(__file__).parents[2] / "scenes"
 # Radius of the disc, about half an incident triangle.
@@ -104,6 +106,19 @@ def test_the_stabilised_form_is_right_at_every_level(valence, offset):
     cage, exact = cage_and_normals(valence, offset)
     assert normal_errors(cage, exact, "stabilized", np.float32).max() < 1e-4
     assert normal_errors(cage, exact, "stabilized", np.float64).max() < 1e-9
+
+
+def test_turned_at_random_the_stabilised_form_has_the_errors_of_single_precision():
+    """In the ball's own directions zeros hide them: below 1e-7 degrees, which no float32 normal can be right to."""
+    errors = []
+    for ball in normal_error.turned(extraordinary(5)):
+        cage = normal_error.offset_cage(ball, normal_error.DISTANCE)
+        exact = LimitSurface(cage).evaluate(0, [[0.0, 0.0]]).n[0]
+        errors.append(normal_angle(LimitSurface(cage).tessellate(4, "stabilized", np.float32).normals[0], exact))
+    # Half a unit in the last place of a component near one is 2e-6 degrees.
+    assert 5e-7 < np.median(errors) < 1e-5
+    error = normal_error.error_at_vertex(LimitSurface(cage), 4, "stabilized", 0.0)
+    assert error == errors[-1]
 
 
 def test_the_limit_normal_is_reached_as_the_eigenvalues_say():

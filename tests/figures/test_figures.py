@@ -1,15 +1,17 @@
 """Every figure draws, and the numbers in them are those of the surfaces."""
 
+import csv
 import hashlib
 import json
 import re
+import warnings
 from functools import partial
 from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface, example_file
+from mitsuba_subdivision import CageWarning, ControlCage, LimitSurface, __version__, example_file
 from mitsuba_subdivision.__main__ import parser
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.figures import (
@@ -24,10 +26,20 @@ from mitsuba_subdivision.figures import (
     scenes,
 )
 from mitsuba_subdivision.figures.output import write_figure
-from mitsuba_subdivision.figures.staging import around_vertices, frame, project, visible
+from mitsuba_subdivision.figures.staging import (
+    around_vertices,
+    frame,
+    in_view,
+    load_stage,
+    motion,
+    moved,
+    project,
+    visible,
+)
 from mitsuba_subdivision.regression.image import read_channels
 from mitsuba_subdivision.schemes import scheme_named
-from patches.closed_cages import torus
+from patches.closed_cages import extraordinary_triangles, torus
+from PIL import Image
 from scipy.spatial import cKDTree
 
 # Small enough that all together take seconds.
@@ -54,7 +66,7 @@ def coarse(monkeypatch):
     monkeypatch.setitem(write_figure.__kwdefaults__, "layouts", 1)
     constants = {
         "cages": {"CREASE_RATE": 3},
-        "normal_error": {"VALENCES": (3,), "OFFSETS": (0,), "LEVELS": np.arange(3)},
+        "normal_error": {"VALENCES": (3,), "OFFSETS": (0,), "LEVELS": np.arange(3), "TURNS": normal_error.TURNS[:2]},
         "scenes": {"COLUMNS": 96, "ROWS": 96},
         "zebra": {"FINE_LEVEL": 3, "OWN_LEVEL": 3, "STRIPE_PIXELS": 256},
         "fit": {"STEPS": 2, "CREASE_STEPS": 1, "RATE": 4, "PIXELS": 12, "BOX_PIXELS": 12, "VIEWS": 2, "SPP": 1}
@@ -90,21 +102,21 @@ RENDERED_TWICE, WRITTEN_TWICE = "shading", "refinement"
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_figure_draws_without_warnings_fit_for_print(name, options):
     """In a column, where its PDF has text of 6 points, embedded fonts and the pixels that were rendered."""
-    figure, stem = FIGURES[name], "normal_error" if name == "error" else name
+    figure = FIGURES[name]
 
     def drawn(formats):
         files = figure(options(formats=formats, width=COLUMN))
         return {path.name: hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
     first = drawn(figure.formats)
-    files = {f"{stem}.{suffix}" for suffix in figure.formats}
+    files = {f"{name}.{suffix}" for suffix in figure.formats}
     assert set(first) == {path.name for path in options().output.iterdir()} == files
     again = {RENDERED_TWICE: ("exr",), WRITTEN_TWICE: figure.formats}.get(name, ())
     if again:
         assert drawn(again).items() <= first.items()
 
     pypdf = pytest.importorskip("pypdf")
-    page = pypdf.PdfReader(options().output / f"{stem}.pdf").pages[0]
+    page = pypdf.PdfReader(options().output / f"{name}.pdf").pages[0]
     assert float(page.mediabox.width) == pytest.approx(COLUMN / 25.4 * 72)
     sizes = []
     page.extract_text(visitor_text=lambda text, _cm, _tm, _font, size: sizes.append(size) if text.strip() else None)
@@ -128,19 +140,45 @@ def users_cage(tmp_path):
 
 
 def test_cages_around_a_vertex_have_it_first_and_where_it_is_asked_for(users_cage):
-    like = frame(LimitSurface(extraordinary(5)))
-    ((valence, cage),) = around_vertices(users_cage, 3, like).items()
-    assert valence == 3 == cage.topology.vertex_face_count[0]
-    assert cage.face_vertices.reshape(-1, 4)[:valence, 0].tolist() == [0] * valence
+    ((name, cage),) = around_vertices(users_cage, 3).items()
+    assert (name, cage.topology.vertex_face_count[0]) == ("valence 3", 3)
+    assert cage.face_vertices.reshape(-1, 4)[:3, 0].tolist() == [0] * 3
     assert len(cage.holes) < cage.face_count
-    for result, expected in zip(frame(LimitSurface(cage)), like, strict=True):
-        np.testing.assert_allclose(result, expected, atol=1e-9)
-    # The same surface, but for where it lies: ratios of fit.distances stay.
+    # It is the refined cage where that lies, in another order.
     original = ControlCage.from_file(users_cage)
     while original.face_count < cage.face_count:
         original = original.refined()
-    spread = [np.linalg.norm(cage.positions - cage.positions.mean(axis=0), axis=1) for cage in (original, cage)]
-    np.testing.assert_allclose(*(np.sort(values / values.max()) for values in spread), rtol=1e-9)
+    np.testing.assert_array_equal(*(np.sort(each.positions, axis=0) for each in (cage, original)))
+    like = frame(LimitSurface(extraordinary(5)))
+    placed = cage.with_positions(moved(cage.positions, motion(frame(LimitSurface(cage)), like)))
+    for result, expected in zip(frame(LimitSurface(placed)), like, strict=True):
+        np.testing.assert_allclose(result, expected, atol=1e-9)
+
+
+def test_centres_of_faces_count_only_if_a_cage_has_no_other_extraordinary_vertex(tmp_path):
+    ends = np.concatenate([np.eye(3), -np.eye(3)])
+    octahedron = ControlCage(
+        ends, [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
+    )
+    for cage, expected in (
+        (extraordinary_triangles(7), ["valence 6", "valence 7"]),
+        (octahedron, ["centre of a face of 3"]),
+    ):
+        cage.save(tmp_path / "own.obj")
+        assert list(around_vertices(tmp_path / "own.obj", 2)) == expected
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_the_whole_cage_is_in_the_picture_of_creases():
+    sensor = load_stage("creases", width=20, height=31).sensors()[0]
+    for shape in ([1, 1, 1], [9, 1, 1], [1, 9, 0.1], [0.1, 0.1, 9]):
+        cage = cube().with_positions(7 + cube().positions * shape)
+        shown = in_view(cage, sensor)
+        x, y = project(sensor, shown.positions).T
+        assert min(x.min(), y.min(), 20 - x.max(), 31 - y.max()) > 0
+        # It fills the picture in one direction, but for the margin and a step of its sizes.
+        assert max(np.ptp(x) / 20, np.ptp(y) / 31) > 0.4
+        assert shown.positions[:, 2].min() == 0
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse")
@@ -150,6 +188,59 @@ def test_figures_take_cages_of_users(name, options, users_cage):
     first = path.read_bytes()
     FIGURES[name](options(formats=("png",)))
     assert path.read_bytes() != first
+
+
+def test_files_say_what_drew_them_from_which_cage(variant_llvm_ad_rgb, coarse, options, users_cage, monkeypatch):  # noqa: ARG001
+    pypdf = pytest.importorskip("pypdf")
+    monkeypatch.chdir(users_cage.parent)
+    paths = FIGURES["subdivision"](options(cage=Path("own.obj"), width=COLUMN))
+    command = "mitsuba-subdivision figure subdivision --width 84mm --resolution 12 --cage own.obj --spp 1"
+    expected = [
+        f"mitsuba-subdivision {__version__}",
+        f"{command} --variant llvm_ad_rgb",
+        f"own.obj, SHA-256 {hashlib.sha256(users_cage.read_bytes()).hexdigest()}",
+    ]
+    with Image.open(paths[0]) as image:
+        assert [image.info[key] for key in ("Software", "Description", "Source")] == expected
+    information = pypdf.PdfReader(paths[1]).metadata
+    assert [information[f"/{key}"] for key in ("Creator", "Subject", "Keywords")] == expected
+    metadata = read_channels(paths[2])[1]
+    assert [metadata[key] for key in ("version", "command", "cage")] == expected
+    # The command line understands it.
+    assert parser().parse_args(metadata["command"].split()[1:]).cage == Path("own.obj")
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse")
+def test_numbers_of_curvature_are_in_the_units_of_the_cage(options, users_cage, tmp_path):
+    """Of a cage ten times as large, curvature is a tenth, and a figure of one vertex is no tall page."""
+    cage = ControlCage.from_file(users_cage)
+    cage.with_positions(10 * cage.positions).save(tmp_path / "large.obj")
+    columns = []
+    for path in (users_cage, tmp_path / "large.obj"):
+        png, table = FIGURES["curvature"](options(formats=("png", "csv"), cage=path))
+        with table.open(newline="", encoding="utf-8") as file:
+            lines = list(csv.DictReader(file))
+        assert [(line["vertex"], int(line["level"])) for line in lines] == [("valence 3", n) for n in range(41)]
+        columns.append([float(line["largest curvature"]) for line in lines])
+        with Image.open(png) as image:
+            assert image.height < image.width
+    np.testing.assert_allclose(columns[0], 10 * np.array(columns[1]), rtol=1e-6)
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse")
+def test_a_cage_causes_its_warning_once(options, tmp_path):
+    """Two cubes that share a corner: no manifold there."""
+    faces = cube().face_vertices.reshape(-1, 4)
+    shared = np.array([7, *range(8, 15)])
+    with pytest.warns(CageWarning, match="no manifold"):
+        cage = ControlCage([*cube().positions, *(cube().positions[1:] + 2)], [*faces, *shared[faces]])
+    cage.save(tmp_path / "own.obj")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for name in ("subdivision", "curvature", "error"):
+            FIGURES[name](options(formats=("png",), cage=tmp_path / "own.obj"))
+    (warning,) = (w for w in caught if issubclass(w.category, CageWarning))
+    assert "own.obj" in str(warning.message)
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
@@ -212,11 +303,12 @@ def answering(tmp_path):
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse", "no_programs")
-def test_other_programs_are_drawn_only_where_they_are(options):
+def test_other_programs_are_drawn_only_where_they_are_and_told_of(options, capsys):
     for name, pictures in (("zebra", (2, 1)), ("zoom", (4, 2))):
         (path,) = FIGURES[name](options(formats=("exr",)))
         height, width = read_channels(path)[0]["R"].shape
         assert (width, height) == tuple(RESOLUTION * count for count in pictures)
+        assert 'no program "osd_peer"' in capsys.readouterr().err
 
 
 def test_each_panel_of_creases_has_tags_of_its_own():
@@ -320,7 +412,7 @@ def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noq
         # The elements at the point cover the picture, at every magnification.
         extent = np.abs(samples[1][:, -1, :2]).max(axis=1)
         assert extent.min() > 0.9
-        stam, stabilised = (normal_error.normals_by(surface, *samples, name)[2] for name in ("stam", "stabilized"))
+        stam, stabilised = (normal_error.normals_by(surface, samples, name)[2] for name in ("stam", "stabilized"))
         assert stabilised < 1e-4
         assert (stam > wrong) == (magnification > 1)
 

@@ -3,6 +3,7 @@
 from .contents import Attribute, CageContents, same, same_topology
 from .control_cage import ControlCage
 from .errors import CageError, CageSource, CageWarning, in_digits, noting_warnings, shortened, warn, without_warnings
+from .named_cages import cube, extraordinary
 from .validation import require_range
 
 __all__ = [
@@ -12,6 +13,8 @@ __all__ = [
     "CageSource",
     "CageWarning",
     "ControlCage",
+    "cube",
+    "extraordinary",
     "in_digits",
     "noting_warnings",
     "require_range",

@@ -29,14 +29,14 @@ def figure(parser: CommandParser) -> None:
     add("name", choices=[*FIGURES, "all"], metavar="NAME", help='a figure below, or "all"')
     add("-o", "--output", type=Path, default=DRAWN, metavar="DIR", help="folder to write to (default: %(default)s)")
     add("--resolution", type=positive, metavar="N", help="width of a panel in pixels (default: 512)")
-    add("--spp", type=positive, metavar="N", help="samples per pixel (default: 256)")
+    add("--spp", type=positive, metavar="N", help="samples per pixel (default: 256, or 32 for artifact)")
     text = f"width on paper, as 84mm or 7in (default: {PAGE:g}mm, or {COLUMN:g}mm for figures of a column)"
     add("--width", type=_width, metavar="LENGTH", help=text)
     text = f"one of {', '.join(BUILT_IN)} (default: catmull_clark)"
     add("--scheme", choices=BUILT_IN, metavar="SCHEME", help=text)
     takers = ", ".join(name for name, figure in FIGURES.items() if "cage" in figure.options)
     add("--cage", type=Path, metavar="FILE", help=f"a Catmull-Clark cage of your own, for {takers}")
-    text = "png, pdf or exr; can be repeated (default: all that the figure has)"
+    text = "png, pdf, exr or csv; can be repeated (default: all that the figure has)"
     add("--format", choices=FigureOptions.formats, action="append", dest="formats", metavar="FORMAT", help=text)
     add_variant(parser)
     parser.set_defaults(run=_figure)
@@ -57,7 +57,7 @@ def _figure(options: argparse.Namespace) -> None:
     for name, figure in FIGURES.items():
         takes_all = bool(wanted & set(figure.formats)) and (not options.cage or "cage" in figure.options)
         if options.name == name or (options.name == "all" and takes_all):
-            for path in figure(FigureOptions(options.output, **{"width": figure.width, **given})):
+            for path in figure(FigureOptions(options.output, **{"width": figure.width, "spp": figure.spp, **given})):
                 print_result(path)
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from ..cage import without_warnings
 from .output import COLUMN, PAGE, FigureError, FigureOptions
 
 __all__ = ["FIGURES", "Figure", "FigureError", "FigureOptions", "require_options"]
@@ -30,11 +31,14 @@ class Figure:
     # Those of "spp", "scheme" and "cage" that change the figure; "resolution" and "width" change all
     options: tuple[str, ...] = ()
     width: float = PAGE  # Width on paper in millimetres, unless the options have another
+    spp: int = FigureOptions.spp  # Samples per pixel, likewise
+    has_numbers: bool = False  # Whether they are written as CSV
 
     @property
     def formats(self) -> tuple[str, ...]:
-        """Of "png", "pdf" and "exr": the last for figures that are rendered."""
-        return FigureOptions.formats if "spp" in self.options else FigureOptions.formats[:-1]
+        """Of "png", "pdf", "exr" for figures that are rendered, and "csv" for those that plot numbers."""
+        left_out = {"exr": "spp" not in self.options, "csv": not self.has_numbers}
+        return tuple(name for name in FigureOptions.formats if not left_out.get(name))
 
     def __call__(self, options: FigureOptions) -> list[Path]:
         try:
@@ -43,7 +47,11 @@ class Figure:
             raise FigureError("figures need matplotlib: pip install 'mitsuba-subdivision[figures]'") from error
         module = importlib.import_module(f".{self.module}", __name__)
         draw: Callable[[FigureOptions], list[Path]] = getattr(module, f"draw_{self.name}")
-        return draw(options)
+        if options.cage:
+            # Warns about the cage, once: the figure makes others of it.
+            importlib.import_module(".staging", __name__).read(options.cage)
+        with without_warnings():
+            return draw(options)
 
 
 _FIGURES = (
@@ -51,15 +59,15 @@ _FIGURES = (
     Figure("refinement", "characteristic", "control points of a patch before and after one refinement", (), COLUMN),
     Figure("tree", "characteristic", "a face divided into polynomials, and the matrix that makes them", (), COLUMN),
     Figure("domains", "characteristic", "parameter domains of the regular patches at each level", ("scheme",), COLUMN),
-    Figure("artifact", "normal_error", "normals by (11), (12) and (13)", ("spp", "scheme", "cage")),
-    Figure("error", "normal_error", "errors of these normals against level", ("cage",)),
+    Figure("artifact", "normal_error", "normals by (11), (12) and (13)", ("spp", "scheme", "cage"), spp=32),
+    Figure("error", "normal_error", "errors of these normals against level", ("cage",), has_numbers=True),
     Figure("schemes", "scenes", "one cage under the three schemes", ("spp",)),
     Figure("creases", "cages", "one cage with smooth, semi-sharp and sharp creases", ("spp", "cage")),
     Figure("shading", "scenes", "brushed metal, shaded by vertices and exactly at every hit", ("spp",)),
     Figure("displacement", "scenes", "a jar before and after it is displaced, and its triangles", ("spp",)),
     Figure("zoom", "normal_error", "an extraordinary vertex, magnified up to a million times", ("spp",)),
     Figure("zebra", "zebra", "reflection lines, with exact normals and with others", ("spp", "cage")),
-    Figure("curvature", "characteristic", "curvature around extraordinary vertices", ("cage",)),
+    Figure("curvature", "characteristic", "curvature around extraordinary vertices", ("cage",), has_numbers=True),
     Figure("fit", "fit", "cages fitted to pictures, and how near they come", ("spp",)),
     Figure("hero", "scenes", "a human figure and its control cage", ("spp",)),
 )

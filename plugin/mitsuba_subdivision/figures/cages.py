@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import partial
 from pathlib import Path
 
 import mitsuba as mi
@@ -76,7 +77,7 @@ def draw_subdivision(options: FigureOptions) -> list[Path]:
         axis.plot(*seen.T, "o", color="#d1432b", markersize=2, markeredgecolor="white", markeredgewidth=0.2)
         # The part of the square image that the surface fills.
         axis.set(xlim=(0, resolution), ylim=(0.84 * resolution, 0.13 * resolution))
-    return write_figure(options, "subdivision", figure, rendered, levels=LEVELS)
+    return write_figure(options, "subdivision", figure, rendered, cage="propeller.obj", levels=LEVELS)
 
 
 def extraordinary_count(topology: Topology) -> int:
@@ -154,34 +155,28 @@ CAGE_TITLE = "control cage"
 HEIGHT = 1.55
 CREASE_RATE = 24
 INFINITE = 10
-MATERIAL = {
-    "type": "principled",
-    "base_color": {"type": "rgb", "value": [0.55, 0.30, 0.13]},
-    "roughness": 0.3,
-    "specular": 0.5,
-    "clearcoat": 0.6,
-    "clearcoat_gloss": 0.95,
-}
+LACQUER = {"roughness": 0.3, "specular": 0.5, "clearcoat": 0.6, "clearcoat_gloss": 0.95}
+MATERIAL = {"type": "principled", "base_color": {"type": "rgb", "value": [0.55, 0.30, 0.13]}, **LACQUER}
 # Colour of the cage's faces in sRGB; colour and radius of its edges, from this sharpness on. The cage is 2.7 high.
 PALE = "#e4e4e1"
-EDGES = {0: ("#9aa1ab", 0.006), 1: ("#f2a541", 0.014), 3: ("#e0602a", 0.014), INFINITE: ("#a3123f", 0.014)}
+EDGES = {0: ("#9aa1ab", 0.006), 1: ("#f2a541", 0.014), 3: ("#2f8f83", 0.014), INFINITE: ("#5b2a86", 0.014)}
 
 
 def draw_creases(options: FigureOptions) -> list[Path]:
     """Render a cage, and its Catmull-Clark surface without creases, with the cage's own, and with all of them sharp."""
+    stage = staging.load_stage("creases", width=options.resolution, height=round(HEIGHT * options.resolution))
     cage = ControlCage.from_file(example_file("cages/rook.obj"))
     if options.cage:
-        cage = staging.fitted(staging.read(options.cage), cage.positions.min(axis=0), cage.positions.max(axis=0))
+        cage = staging.in_view(staging.read(options.cage), stage.sensors()[0])
         if not cage.tags.edges.any():
             raise FigureError(f'"{options.cage}" has no creases; expected a cage with some')
-    stage = staging.load_stage("creases", width=options.resolution, height=round(HEIGHT * options.resolution))
     scenes = {CAGE_TITLE: staging.staged(stage, **_cage_shapes(cage))}
     for name, title in TITLES.items():
         scenes[title] = staging.staged(stage, shape=staging.limit_surface(_tagged(cage, name), CREASE_RATE, MATERIAL))
     figure, axes = panels(options, *rows_of(options, len(scenes)))
     rendered = staging.render_panels(options, axes, scenes.items())
     _draw_legend(axes[0, 0], cage)
-    return write_figure(options, "creases", figure, rendered, pictures=[CAGE_TITLE, *TITLES])
+    return write_figure(options, "creases", figure, rendered, cage="rook.obj", pictures=[CAGE_TITLE, *TITLES])
 
 
 def _tagged(cage: ControlCage, name: str) -> ControlCage:
@@ -208,9 +203,8 @@ def _cage_shapes(cage: ControlCage) -> SceneNode:
 
 def labels(sharpness: NDArray[np.floating]) -> dict[int, str]:
     """Ranges of the sharpness of creases by their least values in `EDGES`."""
-    ends = [*EDGES, np.inf]
     ranges = {}
-    for least, end in itertools.pairwise(ends):
+    for least, end in itertools.pairwise([*EDGES, np.inf]):
         values = np.unique(sharpness[(sharpness >= least) & (sharpness < end) & (sharpness > 0)])
         if len(values):
             ends_of_range = dict.fromkeys(f"{value:g}" for value in values[[0, -1]])
@@ -221,17 +215,11 @@ def labels(sharpness: NDArray[np.floating]) -> dict[int, str]:
 def _draw_legend(axis: Axes, cage: ControlCage) -> None:
     """Draw the colours of sharpness below the cage."""
     shown = labels(cage.tags.edges)
-    handles = [Line2D([], [], color=EDGES[least][0], linewidth=2, label=label) for least, label in shown.items()]
+    # Squares, as a line before a number reads as a minus sign.
+    square = partial(Line2D, [], [], linestyle="none", marker="s", markersize=4)
+    handles = [square(color=EDGES[least][0], label=label) for least, label in shown.items()]
     handles.insert(0, Line2D([], [], linestyle="none", label="sharpness"))
-    legend = axis.legend(
-        handles=handles,
-        loc="upper center",
-        bbox_to_anchor=(0.5, 0.0),
-        ncols=len(handles),
-        handlelength=0.9,
-        handletextpad=0.3,
-        columnspacing=0.9,
-        borderaxespad=0.1,
-    )
+    spaces = {"handlelength": 0.9, "handletextpad": 0.3, "columnspacing": 0.9, "borderaxespad": 0.1}
+    legend = axis.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0), ncols=len(handles), **spaces)
     # Captions of other panels reserve the room for it.
     legend.set_in_layout(False)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import matplotlib
 import numpy as np
@@ -131,7 +129,7 @@ def draw_domains(options: FigureOptions) -> list[Path]:
     bar.set_ticks(range(LEVELS))
     bar.ax.tick_params(length=0)
     bar.set_label("level $n$")
-    return write_figure(options, options.name_for_scheme("domains"), figure)
+    return write_figure(options, "domains", figure, cage="none")
 
 
 def refinement_step(patch: IrregularPatch, valence: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -174,7 +172,7 @@ def draw_refinement(options: FigureOptions) -> list[Path]:
     after.plot(*new.T, "o", mfc="white", mec="black", mew=0.6, markersize=3, zorder=5)
     before.set(title=f"a patch of valence {VALENCE}", xlabel=f"$K$ = {len(old)} control points")
     after.set(title="one refinement", xlabel=f"$M$ = {len(new)} new control points")
-    return write_figure(options, "refinement", figure)
+    return write_figure(options, "refinement", figure, cage="none")
 
 
 def draw_tree(options: FigureOptions) -> list[Path]:
@@ -226,7 +224,7 @@ def draw_tree(options: FigureOptions) -> list[Path]:
         title="coefficients of all leaves =\nmatrix × control points",
         xlabel=f"$K$ = {count} control points\n{len(leaves)} leaves, {size} coefficients each",
     )
-    return write_figure(options, "tree", figure)
+    return write_figure(options, "tree", figure, cage="none")
 
 
 def _in_the_plane(topology: Topology) -> FloatArray:
@@ -257,12 +255,16 @@ CURVATURE_VALENCES = (3, 5, 8)
 # The ball of `extraordinary` is bent by z += BEND (x^2 - y^2): principal curvatures of about 1 - 2 BEND and 1 + 2 BEND.
 # Without the bend, the symmetry of the ball would make the leading terms at the vertex vanish.
 BEND = 0.35
-# Radius of the discs, in the tangent plane.
-RADIUS = 0.21
-# Curvature beyond LIMIT is drawn in the last colour. Colours are linear up to LINEAR, then logarithmic.
-LIMIT, LINEAR = 8.0, 1.0
-# Lines of equal curvature, up to the border between both signs.
-NEGATIVE = (-2, -0.5, 0)
+# Radius of the discs in the tangent plane, as a part of the largest that the elements at the vertex cover. Within
+# MIDDLE of it, curvature may grow without bound: it decides on no colours, and has no lines.
+RADIUS, MIDDLE = 0.95, 0.1
+# Colours are linear up to this part of the largest curvature, then logarithmic.
+LINEAR = 0.2
+# Lines of equal curvature as parts of the largest, up to the border between both signs: a little below zero, as a flat
+# surface has no border.
+NEGATIVE = (-1 / 4, -1 / 16, -1e-3)
+# Curvature below this is a rounding error, in reciprocals of the disc's radius.
+FLAT = 1e-9
 DEPTHS = np.arange(0, 41)
 # Samples of each level for the plot: near the middles of the three regular children, off their diagonals.
 DIRECTIONS = np.array([(1.0, 0.3), (0.8, 0.7), (0.35, 1.0)])
@@ -287,7 +289,8 @@ def curvature_map(surface: LimitSurface, valence: int, count: int) -> NDArray[np
     uv = grid_points(np.concatenate([[0], np.geomspace(1e-3, 1, count)]))
     uv[0] = 1e-4
     points, gaussian, mean = _curvatures(surface, uv, valence)
-    x, y, _ = (points - surface.evaluate(0, [[0, 0]]).p[0]).T
+    point, axes, _ = frame(surface)
+    x, y, _ = ((points - point) @ axes).T
     # Positive where the surface bends inward, as on a ball.
     return np.stack([x, y, gaussian, -mean]).reshape(4, valence, count + 1, count + 1)
 
@@ -307,48 +310,59 @@ def largest_by_level(surface: LimitSurface, valence: int) -> NDArray[np.float64]
 
 
 def draw_curvature(options: FigureOptions) -> list[Path]:
-    """Draw maps of Gaussian and mean curvature at valences 3, 5 and 8, and its growth from level to level."""
-    surfaces = {valence: bent_ball(valence) for valence in CURVATURE_VALENCES}
+    """Draw maps of Gaussian and mean curvature around vertices, and its growth from level to level: a row for each."""
+    surfaces = {f"valence {valence}": bent_ball(valence) for valence in CURVATURE_VALENCES}
     if options.cage:
-        cages = around_vertices(options.cage, len(CURVATURE_VALENCES), frame(bent_ball(5)))
-        surfaces = {valence: LimitSurface(cage) for valence, cage in cages.items()}
-    figure, axes = panels(options, 3, len(surfaces), sharey="row")
-    norm = SymLogNorm(LINEAR, vmin=-LIMIT, vmax=LIMIT)
-    for (valence, surface), column in zip(surfaces.items(), axes.T, strict=True):
-        grids, rate = curvature_map(surface, valence, max(options.resolution // 4, 8)), growth(valence)
-        measured = largest_by_level(surface, valence)
-        for axis, values in zip(column, grids[2:], strict=False):
-            shown = _draw_disc(axis, zip(*grids[:2], values, strict=True), norm)
-        plot = column[-1]
+        cages = around_vertices(options.cage, len(CURVATURE_VALENCES))
+        surfaces = {name: LimitSurface(cage) for name, cage in cages.items()}
+    figure, axes = panels(options, len(surfaces), 3)
+    numbers: list[tuple[object, ...]] = [("vertex", "level", "largest curvature", "by eigenvalues")]
+    for (name, surface), (*discs, plot) in zip(surfaces.items(), axes, strict=True):
+        valence = int(surface.cage.topology.vertex_face_count[0])
+        x, y, *maps = curvature_map(surface, valence, max(options.resolution // 4, 8))
+        away = np.hypot(x, y)
+        radius = RADIUS * float(min(away[:, -1].min(), away[..., -1].min()))
+        for axis, values, power in zip(discs, maps, (2, 1), strict=True):
+            is_shown = (away > MIDDLE * radius) & (away < radius)
+            largest = max(float(np.abs(values[is_shown]).max()), FLAT / radius**power)
+            _draw_disc(axis, (x, y, values), float(f"{1.5 * largest:.0e}"), radius)
+        discs[0].set(ylabel=name, xlabel=f"diameter {2 * radius:.2g} units")
+        measured, rate = np.maximum(largest_by_level(surface, valence), FLAT / radius), growth(valence)
+        grown = measured[-1] * rate ** (DEPTHS - DEPTHS[-1])
         plot.semilogy(DEPTHS, measured, "o", markersize=2, color=SERIES[1][0], label="surface")
-        plot.semilogy(DEPTHS, measured[-1] * rate ** (DEPTHS - DEPTHS[-1]), color=SERIES[0][0], label="(|λ₄|/λ₂²)ⁿ")
-        column[0].set_title(f"valence {valence}")
-        plot.set(xlabel=f"level $n$\n|λ₄|/λ₂² = {rate:.3f}", ylim=(0.3, 1e6), box_aspect=0.75)
+        plot.semilogy(DEPTHS, grown, color=SERIES[0][0], label="(|λ₄|/λ₂²)ⁿ")
+        plot.set(xlabel=f"level $n$, |λ₄|/λ₂² = {rate:.3f}", box_aspect=1)
         plot.grid()
         label_powers(plot.yaxis)
-    for axis, name in zip(axes[:, 0], ("Gaussian", "mean"), strict=False):
-        axis.set_ylabel(name)
-    bar = figure.colorbar(shown, ax=axes[:2], fraction=0.03, pad=0.01, extend="both", shrink=0.8)
-    ticks = [-LIMIT, -2, 0, 2, LIMIT]
+        numbers += [(name, *line) for line in zip(DEPTHS.tolist(), measured.tolist(), grown.tolist(), strict=True)]
+    least, most = (np.log10(end([line[-2:] for line in numbers[1:]])) for end in (np.min, np.max))
+    for plot in axes[:, 2]:
+        plot.set_ylim(10 ** np.floor(least), 10 ** np.ceil(most))
+        plot.minorticks_off()
+    for axis, title in zip(axes[0], ("Gaussian", "mean", "largest"), strict=True):
+        axis.set_title(f"{title} curvature\n1/unit{'²' * (title == 'Gaussian')}")
+    axes[0, 2].legend(loc="upper left")
+    cage = f"extraordinary(n), bent by z += {BEND} (x^2 - y^2)"
+    return write_figure(options, "curvature", figure, cage=cage, numbers=numbers)
+
+
+def _draw_disc(axis: Axes, grids: tuple[NDArray[np.floating], ...], largest: float, radius: float) -> None:
+    """Draw values at x and y around the vertex in a disc, with a bar of their colours."""
+    disc = Circle((0, 0), radius, facecolor="none", edgecolor="black", linewidth=0.5)
+    axis.add_patch(disc)
+    norm = SymLogNorm(LINEAR * largest, vmin=-largest, vmax=largest)
+    for x, y, value in zip(*grids, strict=True):
+        shown = axis.pcolormesh(x, y, value, norm=norm, cmap="PuOr_r", shading="gouraud", rasterized=True)
+        shown.set_clip_path(disc)
+        axis.plot(x[0], y[0], color="black", linewidth=0.3, alpha=0.6, clip_path=disc)
+        # In grey, both ends of the colours are dark: lines of negative curvature are dashed.
+        lined = np.where(np.hypot(x, y) < MIDDLE * radius, np.nan, value)
+        levels = largest * np.array(NEGATIVE)
+        lines = axis.contour(x, y, lined, levels, colors="black", linewidths=0.4, linestyles=("--", "--", "-"))
+        lines.set_clip_path(disc)
+    axis.set(xlim=(-1.02 * radius, 1.02 * radius), ylim=(-1.02 * radius, 1.02 * radius))
+    hide_frame(axis)
+    ticks = [largest * part for part in (-1, -LINEAR, 0, LINEAR, 1)]
+    bar = axis.figure.colorbar(shown, ax=axis, fraction=0.05, pad=0.02, aspect=25, extend="both")
     bar.set_ticks(ticks, labels=[f"{tick:g}" for tick in ticks])
     bar.minorticks_off()
-    bar.set_label("curvature")
-    axes[2, 0].set_ylabel("largest curvature")
-    figure.legend(*plot.get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    return write_figure(options, "curvature", figure)
-
-
-def _draw_disc(axis: Axes, grids: Iterable[tuple[NDArray[np.floating], ...]], norm: Any) -> Any:
-    """Draw values at x and y in a disc around the vertex; returns the last grid drawn, for the colour bar."""
-    disc = Circle((0, 0), RADIUS, facecolor="none", edgecolor="black", linewidth=0.5)
-    axis.add_patch(disc)
-    for x, y, value in grids:
-        shown = axis.pcolormesh(x, y, value, norm=norm, cmap="RdBu_r", shading="gouraud", rasterized=True)
-        shown.set_clip_path(disc)
-        (edge,) = axis.plot(x[0], y[0], color="black", linewidth=0.3, alpha=0.6)
-        edge.set_clip_path(disc)
-        # In grey, both ends of the colours are dark: lines of negative curvature are dashed.
-        axis.contour(x, y, value, levels=NEGATIVE, colors="black", linewidths=0.4).set_clip_path(disc)
-    axis.set(xlim=(-1.02 * RADIUS, 1.02 * RADIUS), ylim=(-1.02 * RADIUS, 1.02 * RADIUS))
-    hide_frame(axis)
-    return shown

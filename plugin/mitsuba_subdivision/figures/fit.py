@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import to_rgb
+from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -70,19 +70,13 @@ LIGHTS = {
         "irradiance": {"type": "rgb", "value": [0.5, 0.8, 1.2]},
     },
 }
-CLAY = {
-    "type": "principled",
-    "base_color": {"type": "rgb", "value": [0.74, 0.24, 0.07]},
-    "roughness": 0.36,
-    "specular": 0.5,
-    "clearcoat": 1.0,
-    "clearcoat_gloss": 0.96,
-}
+GLAZE = {"roughness": 0.36, "specular": 0.5, "clearcoat": 1.0, "clearcoat_gloss": 0.96}
+CLAY = {"type": "principled", "base_color": {"type": "rgb", "value": [0.74, 0.24, 0.07]}, **GLAZE}
 RODS = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.62, 0.66, 0.70]}}
 ROD_RADIUS = 0.009
 # Radius of a crease in the pictures of the box: at sharpness 0, and more for each 1.
 CREASE_RADIUS, CREASE_GROWTH = 0.010, 0.010
-SHARPNESS_COLOURS = ("#9aa1ab", "#f2a541", "#e0602a", "#a3123f")
+SHARPNESS_COLOURS = ("#9aa1ab", "#f2a541", "#2f8f83", "#5b2a86")
 LABELS = {"cage": "cage", "refined": "coarse to fine", "mesh": "dense mesh"}
 # Behind numbers, as dark as the backdrop.
 LABEL = "#343d46"
@@ -127,7 +121,7 @@ def draw_fit(options: FigureOptions) -> list[Path]:
     _plot_sharpness(course_of_sharpness, boxes[0][1], sharpness)
     figure.legend(*distances.get_legend_handles_labels(), loc="outside lower center", ncols=3 if is_page else 2)
     titles = [title.replace("\n", ", ") for title, _ in (*of_balls, *of_boxes)]
-    return write_figure(options, "fit", figure, rendered, pictures=titles)
+    return write_figure(options, "fit", figure, rendered, cage="fitted cages", pictures=titles)
 
 
 def _target() -> ControlCage:
@@ -305,18 +299,14 @@ def _box_panels(boxes: Sequence[Box]) -> list[Panel]:
     for title, (cage, sharpness) in zip((*titles, last), boxes, strict=True):
         # Rods are thicker, and of another colour, where creases are sharper.
         looks = [(_sharpness_colour(value), CREASE_RADIUS + CREASE_GROWTH * value) for value in sharpness.tolist()]
-        shown.append(
-            (title, {"surface": limit_surface(cage, RATE, CLAY), **edge_rods(cage, cube().edges, sharpness, looks)})
-        )
+        rods = edge_rods(cage, cube().edges, sharpness, looks)
+        shown.append((title, {"surface": limit_surface(cage, RATE, CLAY), **rods}))
     return shown
 
 
 def _sharpness_colour(sharpness: float) -> tuple[float, float, float]:
     """Colour in sRGB between those of `SHARPNESS_COLOURS`, for 0 to the highest sharpness."""
-    channels = np.array([to_rgb(colour) for colour in SHARPNESS_COLOURS]).T
-    at = np.linspace(0, HIGHEST, len(SHARPNESS_COLOURS))
-    r, g, b = (float(np.interp(sharpness, at, channel)) for channel in channels)
-    return r, g, b
+    return to_rgb(LinearSegmentedColormap.from_list("sharpness", SHARPNESS_COLOURS)(sharpness / HIGHEST))
 
 
 def _plot_courses(losses: Axes, chamfer: Axes, shape: ControlCage, courses: Mapping[str, Course]) -> None:

@@ -15,6 +15,7 @@ from matplotlib.colors import LogNorm
 from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar  # type: ignore[import-untyped]
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from .. import example_file
 from ..cage import ControlCage
@@ -39,8 +40,9 @@ NEEDLE_LENGTH = 0.07
 EDGE_RADIUS = 0.8
 # What lambda_2^n is at the sample of a cage of a user: eps |c1| / lambda_2^n is 30.
 LOST = 2.0**-23 / 3
-# Captions show smaller errors, in degrees, as "below" this: normals of symmetric cages can be right to all digits.
-NEGLIGIBLE = 1e-8
+DISTANCE = 10  # Of the extraordinary point from the origin
+CLAY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.72, 0.66, 0.58]}}
+TURNS = Rotation.random(20, random_state=19).as_matrix()  # Of the figures' own cages
 # By scheme and valence: the u = v at which the extraordinary point is sampled, and the tessellation rate. At |c1| = 10
 # and about these u = v, float32 loses the normal: its error is about eps |c1| / lambda_2^n, where the subdominant
 # eigenvalues are 0.41 and 0.55 (Catmull-Clark), 0.25 and 0.45 (Loop), 0.5 (Doo-Sabin). The smaller these are, the
@@ -77,69 +79,85 @@ def vertex_normal(surface: LimitSurface, evaluator: Evaluator, offset: float) ->
     return level, float(np.linalg.norm(limit)), float(normal_angle(single.n[0], double.n[0]))
 
 
-def draw_artifact(options: FigureOptions) -> list[Path]:
-    """Render valences 3 and 5 with vertex normals by (11), (12) and (13): columns differ in nothing else."""
-    if options.cage:
-        rows = _rows_of_user(options.cage, options.scheme)
-    else:
-        of_scheme = [(valence, *sampling) for (scheme, valence), sampling in ROWS.items() if scheme == options.scheme]
-        rows = [(valence, surface_of(options.scheme, valence), offset, rate) for valence, offset, rate in of_scheme]
-    figure, axes = panels(options, len(rows), len(RULES))
-    rendered, records = [], []
-    for (valence, surface, beside, rate), row_axes in zip(rows, axes, strict=True):
-        stage = staging.load_stage(f"valence{5 if options.cage else valence}", resolution=options.resolution)
-        emitters = [shape for shape in stage.shapes() if shape.is_emitter()]
-        bsdf = next(shape.bsdf() for shape in stage.shapes() if not shape.is_emitter())
-        for (title, evaluator, is_beside), axis in zip(RULES, row_axes, strict=True):
-            offset = beside if is_beside else 0.0
-            level, distance, error = vertex_normal(surface, evaluator, offset)
-            location = "u = v = 0" if level is None else f"u = v = {scientific(offset)}, n = {level}"
-            shown_error = f"{'below ' * (error < NEGLIGIBLE)}{scientific(max(error, NEGLIGIBLE))}°"
-            if error >= 0.1:
-                shown_error = f"{error:.1f}°"
-            sampling = {"scheme": options.scheme, "evaluator": evaluator, "sample_offset": offset}
-            scene = staging.staged(stage, emitters, surface=staging.limit_surface(surface.cage, rate, bsdf, **sampling))
-            rendered.append(staging.render(scene, options, f"valence {valence}, {title}")[..., :3])
-            show(axis, staging.in_8_bits(rendered[-1]), caption=f"{location}\nerror {shown_error}")
-            _draw_lines(axis, scene, surface, surface.tessellate(rate, evaluator, np.float32, offset))
-            record = {"valence": valence, "rule": title, "level": level, "offset": distance, "error": error}
-            records.append(record)
-        row_axes[0].set_ylabel(f"valence {valence}, |c₁| = {distance:.1f}")
-    for axis, (title, *_) in zip(axes[0], RULES, strict=True):
-        axis.set_title(title)
-    name = options.name_for_scheme("artifact")
-    variant = mi.variant()
-    return write_figure(options, name, figure, rendered, per_row=len(RULES), pictures=records, variant=variant)
+def turned(cage: ControlCage) -> list[ControlCage]:
+    """The cage in several directions. In its own, zeros of its symmetry may hide errors."""
+    return [cage.with_positions(cage.positions @ turn.T) for turn in TURNS]
 
 
-def _rows_of_user(path: Path, scheme: str) -> list[tuple[int, LimitSurface, float, int]]:
-    """Rows of a user's cage, moved to where the scene of valence 5 has its vertex."""
+def of_user(path: Path, scheme: str, most: int) -> dict[str, list[ControlCage]]:
+    """A user's cage by its vertices, in its own directions, with edges at the vertex as long as the figures' own."""
     if scheme != "catmull_clark":
         raise FigureError(f"--cage together with --scheme {scheme}; expected catmull_clark")
-    rows, (_, rate) = [], ROWS[scheme, 5]
-    for valence, cage in staging.around_vertices(path, 2, staging.frame(surface_of(scheme, 5))).items():
-        # Where Stam's form has lost the normal, as above.
-        subdominant = patch_of_valence(scheme_named(scheme), valence).basis.subdominant
-        level = np.log(LOST) / np.log(subdominant)
-        rows.append((valence, LimitSurface(cage, scheme), float(f"{0.5**level:.0e}"), rate))
-    return rows
+    length = staging.frame(surface_of(scheme, 5))[2]
+    return {
+        name: [cage.with_positions(cage.positions * (length / staging.frame(LimitSurface(cage))[2]))]
+        for name, cage in staging.around_vertices(path, most).items()
+    }
 
 
-def _draw_lines(axis: Axes, scene: mi.Scene, surface: LimitSurface, tessellation: Tessellation) -> None:
+def error_at_vertex(surface: LimitSurface, rate: int, evaluator: Evaluator, offset: float) -> float:
+    """Error in degrees of the normal that vertex 0 of a tessellation has, as it is rendered."""
+    normal = surface.tessellate(rate, evaluator, np.float32, offset).normals[0]
+    return float(normal_angle(normal, surface.evaluate(0, np.full((1, 2), offset)).n[0]))
+
+
+def draw_artifact(options: FigureOptions) -> list[Path]:
+    """Render valences 3 and 5 with vertex normals by (11), (12) and (13): columns differ in nothing else."""
+    scheme, (_, rate) = options.scheme, ROWS[options.scheme, 5]
+    rows = {f"valence {n}": (turned(surface_of(scheme, n).cage), *ROWS[scheme, n]) for n in VALENCES}
+    if options.cage:
+        own = of_user(options.cage, scheme, len(VALENCES))
+        rows = {name: (cages, _lost_at(cages[0]), rate) for name, cages in own.items()}
+    figure, axes = panels(options, len(rows), len(RULES))
+    stage, place = staging.load_stage("artifact", resolution=options.resolution), staging.frame(surface_of(scheme, 5))
+    rendered, records = [], []
+    for (name, (cages, beside, rate)), row_axes in zip(rows.items(), axes, strict=True):
+        surfaces = [LimitSurface(offset_cage(cage, DISTANCE, scheme), scheme) for cage in cages]
+        surfaces.sort(key=lambda surface: error_at_vertex(surface, rate, "stam", beside))
+        # The errors are those of this cage, which only its transform puts before the camera.
+        shown = surfaces[len(surfaces) // 2]
+        to_world = staging.motion(here := staging.frame(shown), (*place[:2], here[2]))
+        common = {"scheme": scheme, "to_world": mi.ScalarTransform4f(to_world.tolist())}
+        for (title, evaluator, is_beside), axis in zip(RULES, row_axes, strict=True):
+            offset = beside if is_beside else 0.0
+            level, *_ = vertex_normal(shown, evaluator, offset)
+            errors = [error_at_vertex(surface, rate, evaluator, offset) for surface in surfaces]
+            error = errors[len(surfaces) // 2]
+            location = "u = v = 0" if level is None else f"u = v = {scientific(offset)}, n = {level}"
+            of_all = f"; in {len(errors)} turns up to {_degrees(max(errors))}" if len(errors) > 1 else ""
+            sampling = {**common, "evaluator": evaluator, "sample_offset": offset}
+            scene = staging.staged(stage, surface=staging.limit_surface(shown.cage, rate, CLAY, **sampling))
+            rendered.append(staging.render(scene, options, f"{name}, {title}"))
+            show(axis, staging.on_white(rendered[-1]), caption=f"{location}\nerror {_degrees(error)}{of_all}")
+            axis.set_title(title if name == next(iter(rows)) else "")
+            triangles = shown.tessellate(rate, evaluator, np.float32, offset)
+            _draw_lines(axis, stage.sensors()[0], shown, triangles, to_world)
+            records.append({"vertex": name, "rule": title, "level": level, "error": error})
+        row_axes[0].set_ylabel(f"{name}, |c₁| = {DISTANCE}")
+    cage = "extraordinary vertices of the folder cages, turned at random"
+    return write_figure(options, "artifact", figure, rendered, cage=cage, per_row=len(RULES), pictures=records)
+
+
+def _lost_at(cage: ControlCage) -> float:
+    """The u = v at which Stam's form has lost the normal, at |c1| = 10 as in `ROWS`."""
+    patch = patch_of_valence(scheme_named("catmull_clark"), int(cage.topology.vertex_face_count[0]))
+    return float(f"{0.5 ** (np.log(LOST) / np.log(patch.basis.subdominant)):.0e}")
+
+
+def _draw_lines(axis: Axes, sensor: mi.Sensor, surface: LimitSurface, mesh: Tessellation, to_world: FloatArray) -> None:
     """Draw normals near the extraordinary vertex, and edges of the cage on the surface."""
-    distance = np.linalg.norm(tessellation.positions - tessellation.positions[0], axis=1)
+    distance = np.linalg.norm(mesh.positions - mesh.positions[0], axis=1)
     near = np.flatnonzero(distance < NEEDLE_RADIUS)
-    start = tessellation.positions[near].astype(np.float64)
-    needles = np.stack([start, start + NEEDLE_LENGTH * tessellation.normals[near]], axis=1)
+    start = mesh.positions[near].astype(np.float64)
+    needles = np.stack([start, start + NEEDLE_LENGTH * mesh.normals[near]], axis=1)
     edges = edge_curves(surface, np.arange(surface.patches.elements.half_edge_count), 16)
     edges = edges[np.linalg.norm(edges[:, 0] - edges[0, 0], axis=1) < EDGE_RADIUS]
-    sensor = scene.sensors()[0]
     width, height = sensor.film().crop_size()
     axis.set(xlim=(0, width), ylim=(height, 0))
+    needles, edges = (staging.project(sensor, staging.moved(points, to_world)) for points in (needles, edges))
     # The needle of the extraordinary vertex comes first.
-    first, *others = staging.project(sensor, needles)
-    curves = list(staging.project(sensor, edges))
-    axis.add_collection(LineCollection(curves, colors="#40362a", linewidths=0.3, alpha=0.4))
+    first, *others = needles
+    axis.add_collection(LineCollection(list(edges), colors="#40362a", linewidths=0.3, alpha=0.4))
     axis.add_collection(LineCollection(others, colors="#1c4f72", linewidths=0.6, capstyle="round"))
     axis.add_collection(LineCollection([first], colors="#d8452a", linewidths=1.5, capstyle="round"))
 
@@ -160,44 +178,58 @@ MARKED = 10
 
 def draw_error(options: FigureOptions) -> list[Path]:
     """Plot the angle between computed and exact normals at every level."""
-    cages = {valence: extraordinary(valence) for valence in VALENCES}
+    cages = {f"valence {valence}": turned(extraordinary(valence)) for valence in VALENCES}
     if options.cage:
-        cages = staging.around_vertices(options.cage, len(VALENCES), staging.frame(LimitSurface(extraordinary(5))))
+        cages = of_user(options.cage, options.scheme, len(VALENCES))
     figure, axes = panels(options, len(cages), len(OFFSETS), sharex=True, sharey=True)
-    for row, (valence, cage) in zip(axes, cages.items(), strict=True):
+    numbers: list[tuple[object, ...]] = [("vertex", "c1", "normal", "level", "error in degrees")]
+    for row, (name, in_turns) in zip(axes, cages.items(), strict=True):
         for axis, offset in zip(row, OFFSETS, strict=True):
-            _draw_panel(axis, offset_cage(cage, offset))
-        row[0].set_ylabel(f"valence {valence}\nerror (degrees)")
-    for axis, offset in zip(axes[0], OFFSETS, strict=True):
-        axis.set_title(f"|c₁| = {offset}")
-    for axis in axes[-1]:
-        axis.set_xlabel("level $n$")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3 if options.width > BETWEEN else 2)
-    return write_figure(options, "normal_error", figure)
+            numbers += [(name, offset, *line) for line in _draw_panel(axis, in_turns, offset)]
+        row[0].set_ylabel(f"{name}\nerror (degrees)")
+    for top, bottom, offset in zip(axes[0], axes[-1], OFFSETS, strict=True):
+        top.set_title(f"|c₁| = {offset}")
+        bottom.set_xlabel("level $n$")
+    figure.legend(
+        *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4 if options.width > BETWEEN else 2
+    )
+    return write_figure(
+        options, "error", figure, cage=f"{len(TURNS)} turns of extraordinary(3) and (5)", numbers=numbers
+    )
 
 
-def _draw_panel(axis: Axes, cage: ControlCage) -> None:
-    exact = exact_normals(cage)
+def _draw_panel(axis: Axes, cages: list[ControlCage], offset: float) -> list[tuple[object, ...]]:
+    """Plot the largest errors of turned cages; returns name, level and error of each point."""
+    numbers: list[tuple[object, ...]] = []
+    rounded, unrounded = ([offset_cage(cage, offset, dtype=dtype) for cage in cages] for dtype in PRECISIONS)
+    exact = [exact_normals(cage) for cage in rounded]
+
+    def plot(cages: list[ControlCage], evaluator: Evaluator, dtype: Any, style: str, label: str, **look: Any) -> None:
+        errors = [normal_errors(cage, n, evaluator, dtype) for cage, n in zip(cages, exact, strict=True)]
+        largest = np.max(errors, axis=0)
+        axis.semilogy(LEVELS, np.maximum(largest, 1e-15), style, label=label, **look)
+        numbers.extend((label, level, error) for level, error in zip(LEVELS.tolist(), largest.tolist(), strict=True))
+
     for i, ((evaluator, label), (colour, marker)) in enumerate(zip(EQUATIONS.items(), SERIES, strict=True)):
         for dtype, style in PRECISIONS.items():
-            error = np.maximum(normal_errors(cage, exact, evaluator, dtype), 1e-15)
             marked = (MARKED * i // len(EQUATIONS), MARKED)
             look = {"color": colour, "marker": marker, "markevery": marked, "mfc": colour if style == "-" else "white"}
-            axis.semilogy(LEVELS, error, style, **look, label=f"{label}, {dtype.__name__}")
+            plot(rounded, evaluator, dtype, style, f"{label}, {dtype.__name__}", **look)
+    plot(unrounded, "stabilized", np.float64, ":", "rounding the cage to float32", color="0.5")
     axis.set(box_aspect=1, xlim=(LEVELS[0], LEVELS[-1]), yticks=10.0 ** np.arange(-15, 4, 6), ylim=(1e-15, 1e3))
     label_powers(axis.yaxis)
     axis.grid()
+    return numbers
 
 
-def offset_cage(cage: ControlCage, offset: float) -> ControlCage:
-    """A cage, moved so that the limit point of vertex 0 has this distance from the origin."""
-    limit = LimitSurface(cage).evaluate(0, [[0.0, 0.0]]).p[0]
+def offset_cage(cage: ControlCage, offset: float, scheme: str | None = None, dtype: Any = np.float32) -> ControlCage:
+    """A cage, moved so that the limit point of vertex 0 has this distance from the origin, and rounded."""
+    limit = LimitSurface(cage, scheme).evaluate(0, [[0.0, 0.0]]).p[0]
     # A direction that favours no axis, and is neither normal nor tangent to the surface.
     direction = np.array([0.48, 0.6, 0.64])
     moved = cage.positions - limit + offset * direction
     # Every evaluator gets the same numbers.
-    return cage.with_positions(moved.astype(np.float32).astype(np.float64))
+    return cage.with_positions(moved.astype(dtype).astype(np.float64))
 
 
 def normal_errors(cage: ControlCage, exact: FloatArray, evaluator: Evaluator, dtype: Any) -> FloatArray:
@@ -258,9 +290,8 @@ HALF_WIDTH = 0.19
 BAR = 0.1
 # Range of the colours in degrees. Below the least error, float32 cannot tell most unit vectors from the exact ones.
 LEAST_ERROR, MOST_ERROR = 1e-6, 100
-COLOURS, ERROR_SCALE = "YlOrRd", LogNorm(LEAST_ERROR, MOST_ERROR, clip=True)
+COLOURS, ERROR_SCALE = "magma_r", LogNorm(LEAST_ERROR, MOST_ERROR, clip=True)
 LINE_POINTS = 33
-CLAY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.72, 0.66, 0.58]}}
 
 
 def on_stage(surface: LimitSurface, points: NDArray[np.floating], magnification: float) -> NDArray[np.float64]:
@@ -271,7 +302,7 @@ def on_stage(surface: LimitSurface, points: NDArray[np.floating], magnification:
 
 def draw_zoom(options: FigureOptions) -> list[Path]:
     """Draw a vertex of valence 5 at four magnifications: rendered, and the errors of normals, too small for shades."""
-    surface = LimitSurface(offset_cage(extraordinary(ZOOM_VALENCE), ZOOM_OFFSET))
+    surface = LimitSurface(offset_cage(turned(extraordinary(ZOOM_VALENCE))[0], ZOOM_OFFSET))
     stage, resolution = staging.load_stage("zoom", resolution=options.resolution), options.resolution
     sensor, count = stage.sensors()[0], max(resolution // 2, 8)
     triangles = staging.grid_triangles(count, ZOOM_VALENCE)
@@ -279,14 +310,14 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
     figure, axes = panels(options, len(rows), len(MAGNIFICATIONS))
     rendered, records = [], []
     for magnification, column in zip(MAGNIFICATIONS, axes.T, strict=True):
-        uv, positions, exact = panel_samples(surface, magnification, count)
+        samples = panel_samples(surface, magnification, count)
         # Of all elements' samples, the one that is nearest to the centre of each pixel, ``(height, width)``.
-        points = positions.reshape(-1, 3)
+        points = samples[1].reshape(-1, 3)
         centres = staging.grid_points(np.arange(resolution) + 0.5).reshape(resolution, -1, 2)
         nearest = np.asarray(cKDTree(staging.project(sensor, points)).query(centres)[1])
         lines = staging.project(sensor, _level_lines(surface, magnification))
         for method, axis in zip(rows, column, strict=True):
-            normals, errors, median = normals_by(surface, uv, positions, exact, method)
+            normals, errors, median = normals_by(surface, samples, method)
             on_mesh = (normals @ staging.frame(surface)[1]).reshape(-1, 3)
             mesh = staging.make_mesh(points, triangles, CLAY, vertex_normals=on_mesh)
             name = f"{METHODS[method]}, x {magnification}".replace("\n", ", ")
@@ -308,7 +339,8 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
     label_powers(colours.ax.yaxis)
     strips = [pixels for i in range(len(rows)) for pixels in rendered[i :: len(rows)]]
     count = len(MAGNIFICATIONS)
-    return write_figure(options, "zoom", figure, strips, per_row=count, pictures=records, offset=ZOOM_OFFSET)
+    cage = f"extraordinary({ZOOM_VALENCE}), turned, {ZOOM_OFFSET} from the origin"
+    return write_figure(options, "zoom", figure, strips, cage=cage, per_row=count, pictures=records)
 
 
 def parameter_extent(magnification: float) -> float:
@@ -332,16 +364,9 @@ def panel_samples(surface: LimitSurface, magnification: float, count: int) -> tu
     return uv, on_stage(surface, exact.p, magnification).reshape(shape), exact.n.reshape(shape)
 
 
-def normals_by(
-    surface: LimitSurface,
-    # As `panel_samples` returns them
-    uv: FloatArray,
-    positions: FloatArray,
-    exact: FloatArray,
-    method: Method,
-) -> tuple[FloatArray, FloatArray, float]:
-    """Normals in float32, their angles to the exact ones in degrees, and the median of those inside the image."""
-    elements = np.arange(ZOOM_VALENCE)[:, None]
+def normals_by(surface: LimitSurface, samples: tuple[FloatArray, ...], method: Method) -> tuple[Any, Any, float]:
+    """Normals in float32 at `panel_samples`, their angles to the exact ones in degrees, and the median in the image."""
+    (uv, positions, exact), elements = samples, np.arange(ZOOM_VALENCE)[:, None]
     if method == "opensubdiv":
         program = osd_peer()
         if program is None:

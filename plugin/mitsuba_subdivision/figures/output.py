@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import csv
 import os
+import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import __version__
+from ..messages import PROGRAM
 from ..whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -25,8 +30,9 @@ PAGE, COLUMN, BETWEEN, INCH = 178.0, 84.0, 120.0, 25.4
 PAD, LAYOUTS = 0.02, 8
 # Sizes of text in points at a column and at a page: exponents and indices are characters of the same size.
 TEXT_SIZES = (6.0, 7.0)
-# Colours and markers of series, which differ in grey and for colour-blind readers.
-SERIES = (("#c8432b", "s"), ("#12395c", "o"), ("#d9a53f", "^"))
+# Colours and markers of series, which differ in grey and for colour-blind readers. None is red, the colour of
+# extraordinary points.
+SERIES = (("#2f8f83", "s"), ("#12395c", "o"), ("#d9a53f", "^"))
 STYLE: dict[Any, Any] = {
     "pdf.fonttype": 42,
     "mathtext.fontset": "dejavusans",
@@ -61,18 +67,20 @@ class FigureOptions:
     """Options of a figure."""
 
     output: Path  # Folder to write to; created if it is missing
-    # Width of a panel in pixels. Pictures are rendered at this width; PDF files hold their pixels as they are.
-    resolution: int = 512
+    resolution: int = 512  # Width of a panel in pixels, at which pictures are rendered
     spp: int = 256  # Samples per pixel of a rendered image
     width: float = PAGE  # Width of the figure on paper in millimetres
-    formats: tuple[str, ...] = ("png", "pdf", "exr")  # Which of "png", "pdf" and "exr" to write, if the figure has them
+    formats: tuple[str, ...] = ("png", "pdf", "exr", "csv")  # Which of these to write, if the figure has them
     scheme: str = "catmull_clark"  # Subdivision scheme, for the figures that show one scheme of several
-    # File of a Catmull-Clark cage to show in place of the figure's own, for the figures that take one
-    cage: Path | None = None
+    cage: Path | None = None  # File of a Catmull-Clark cage to show, for the figures that take one
 
-    def name_for_scheme(self, name: str) -> str:
-        """Name of the files of a figure that shows one scheme of several."""
-        return name if self.scheme == type(self).scheme else f"{name}_{self.scheme}"
+    def command(self, name: str, variant: str | None) -> str:
+        """The command line that draws a figure again, with the variant and samples if it is rendered."""
+        values: dict[str, object] = {"width": f"{self.width:g}mm", "resolution": self.resolution, "cage": self.cage}
+        values |= {"scheme": self.scheme} if self.scheme != type(self).scheme else {}
+        values |= {"spp": self.spp, "variant": variant} if variant else {}
+        words = [word for key, value in values.items() if value for word in (f"--{key}", str(value))]
+        return shlex.join([PROGRAM, "figure", name, *words])
 
 
 def panels(options: FigureOptions, rows: int, columns: int, **more: Any) -> tuple[Figure, Any]:
@@ -106,41 +114,58 @@ def write_figure(
     figure: Figure,
     rendered: Sequence[NDArray[np.floating]] = (),  # Linear pixels of pictures of one height, whose R, G and B are kept
     *,
+    cage: str,  # What the figure shows without a cage of the user
     per_row: int | None = None,  # Pictures side by side; by default, all
+    pixels: int | None = None,  # Width of the first axes; by default, that of the options
     layouts: int = LAYOUTS,  # How often the height of the figure is set to that of its contents
+    numbers: Sequence[Sequence[object]] = (),  # Rows of a table, names of columns first
     **metadata: Any,  # Of the pixels, besides their samples
 ) -> list[Path]:
-    """Write a figure as PNG and as PDF, and its pictures as OpenEXR, if these formats are wanted, and close it.
+    """Write a figure as PNG and PDF, its pictures as OpenEXR and its numbers as CSV, where wanted, and close it.
 
-    The first axes of the figure get the width in pixels that the options say. Pictures keep their pixels in PDF.
-    Returns the files written, each of which appears whole or not at all.
+    Pictures keep their pixels in PDF. Images have the version, the command and the cage as metadata. Returns the files
+    written, each of which appears whole or not at all.
     """
+    import mitsuba as mi
     from matplotlib.image import AxesImage
-    from matplotlib.pyplot import close
+    from matplotlib.pyplot import close, setp
 
+    # Pictures are resampled whenever they are drawn, which a layout does not need.
+    setp(images := figure.findobj(AxesImage), visible=False)
     # Panels of a fixed aspect leave room above and below them. A half of that to a legend is left each time.
     for _ in range(layouts):
         figure.draw_without_rendering()
         figure.set_size_inches(figure.get_figwidth(), figure.get_tightbbox().height + 2 * PAD)
     figure.draw_without_rendering()
-    dpi = options.resolution / (figure.axes[0].get_window_extent().width / figure.dpi)
+    setp(images, visible=True)
+    dpi = (pixels or options.resolution) / (figure.axes[0].get_window_extent().width / figure.dpi)
     options.output.mkdir(parents=True, exist_ok=True)
-    formats = ("png", "pdf", "exr") if rendered else ("png", "pdf")
-    paths = [options.output / f"{name}.{suffix}" for suffix in formats if suffix in options.formats]
+    stem = name if options.scheme == type(options).scheme else f"{name}_{options.scheme}"
+    left_out = {"exr": not rendered, "csv": not numbers}
+    paths = [options.output / f"{stem}.{suffix}" for suffix in options.formats if not left_out.get(suffix)]
+    if options.cage:
+        cage = f"{options.cage}, SHA-256 {sha256(options.cage.read_bytes()).hexdigest()}"
+    command = options.command(name, mi.variant() if rendered else None)
+    origin = {"version": f"{PROGRAM} {__version__}", "command": command, "cage": cage}
     for path in paths:
+        if path.suffix == ".csv":
+            with whole_file(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
+                csv.writer(file).writerows(numbers)
+            continue
         if path.suffix == ".exr":
             from ..regression.image import write_exr
 
             count = per_row or len(rendered)
             rows = [np.concatenate(rendered[i : i + count], axis=1) for i in range(0, len(rendered), count)]
-            write_exr(path, np.concatenate(rows)[..., :3], {**metadata, "spp": options.spp})
+            write_exr(path, np.concatenate(rows)[..., :3], {**origin, **metadata, "spp": options.spp})
             continue
-        more: dict[str, Any] = {"pil_kwargs": {"optimize": True}} if path.suffix == ".png" else {}
-        if path.suffix == ".pdf":
-            for image in figure.findobj(AxesImage):
-                image.set_interpolation("none")
+        is_pdf = path.suffix == ".pdf"
+        keys = ("Creator", "Subject", "Keywords") if is_pdf else ("Software", "Description", "Source")
+        more: dict[str, Any] = {} if is_pdf else {"pil_kwargs": {"optimize": True}}
+        if is_pdf:
+            setp(images, interpolation="none")
         with whole_file(path) as beside:
-            figure.savefig(beside, dpi=dpi, **more)
+            figure.savefig(beside, dpi=dpi, metadata=dict(zip(keys, origin.values(), strict=True)), **more)
     close(figure)
     return paths
 

@@ -1,7 +1,7 @@
 """Surfaces of OpenSubdiv and Blender, computed by their own programs, for the figures that compare with them.
 
 ``python tests/peers/peers.py`` compiles the program for OpenSubdiv, `osd_peer`. Where a program is not found, figures
-leave out its surface.
+leave out its surface, and say so.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..cage import ControlCage
+from ..messages import print_remark
 from .output import FigureError
 
 # Environment variable with the folder of the programs, where that is not on the path.
@@ -40,6 +41,8 @@ def blender() -> Path | None:
 def _program(name: str, *more: str) -> Path | None:
     folders = filter(None, (os.environ.get(VARIABLE), os.environ.get("PATH"), *more))
     path = shutil.which(name, path=os.pathsep.join(folders))
+    if not path:
+        print_remark(f'its picture is left out: no program "{name}" on the path or in the folder {VARIABLE}')
     return Path(path) if path else None
 
 

@@ -28,30 +28,29 @@ SHADING_TITLES = {"vertex": "normals of vertices", "exact": "exact at every hit"
 def draw_hero(options: FigureOptions) -> list[Path]:
     """Render the scene `human`: the limit surface of a human figure beside its cage."""
     width, height = picture_size(options)
-    scene = load_stage("human", width=width, height=height)
-    pixels = render(scene, options, "mannequin")[..., :3]
+    pixels = render(load_stage("human", width=width, height=height), options, "mannequin")[..., :3]
     return draw_picture(options, "hero", pixels, cage="human.obj, (c) 2010 Tobias Rittig")
 
 
 def draw_schemes(options: FigureOptions) -> list[Path]:
     """Render one cage of triangles, with its edges, under Catmull-Clark, Doo-Sabin and Loop side by side."""
-    return _draw_row(options, "schemes", {title: {"scheme": scheme} for scheme, title in SCHEMES.items()})
+    return _draw_row(options, "schemes", "star.obj", {title: {"scheme": scheme} for scheme, title in SCHEMES.items()})
 
 
 def draw_shading(options: FigureOptions) -> list[Path]:
     """Render brushed metal with normals of vertices, and with those of the surface at every hit."""
     titles = (f"{SHADING_TITLES[kind]}\n{rate} segments per edge" for kind, rate in SHADINGS)
     cases = ({"shading": kind, "rate": rate} for kind, rate in SHADINGS)
-    return _draw_row(options, "shading", dict(zip(titles, cases, strict=True)))
+    return _draw_row(options, "shading", "rook.obj", dict(zip(titles, cases, strict=True)))
 
 
-def _draw_row(options: FigureOptions, name: str, cases: Mapping[str, Mapping[str, Any]]) -> list[Path]:
+def _draw_row(options: FigureOptions, name: str, cage: str, cases: Mapping[str, Mapping[str, Any]]) -> list[Path]:
     """Render the scene of a figure with parameters for each panel, given by titles as in `render_panels`."""
     figure, axes = panels(options, 1, len(cases))
     scenes = ((title, load_stage(name, **case, resolution=options.resolution)) for title, case in cases.items())
     rendered = render_panels(options, axes, scenes)
     metadata: dict[str, Any] = {key: [case[key] for case in cases.values()] for key in next(iter(cases.values()))}
-    return write_figure(options, name, figure, rendered, **metadata)
+    return write_figure(options, name, figure, rendered, cage=cage, **metadata)
 
 
 # Of the jar: how far triangles may be from the surface, in pixels, and in the slice where they are drawn.
@@ -98,7 +97,7 @@ def draw_displacement(options: FigureOptions) -> list[Path]:
         stage = load_stage("displacement", width=width, height=height, first_column=first, columns=count)
         rendered.append(render(staged(stage, jar=jar), options, name)[..., :3])
     pixels = np.concatenate(rendered, axis=1)
-    return draw_picture(options, "displacement", pixels, columns[1:-1], pixel_error=PIXEL_ERROR)
+    return draw_picture(options, "displacement", pixels, columns[1:-1], cage="jar.obj", pixel_error=PIXEL_ERROR)
 
 
 def quilt() -> NDArray[np.float32]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -28,12 +28,12 @@ PART_SAMPLES = 1 << 26
 WIDER, HEIGHT = 2.25, 0.625
 # Points are lifted off their surface by this part of their distance to the camera, before they are tested.
 LIFT = 2e-3
-# How often a cage is refined until an extraordinary vertex has no other one in the faces around it.
-REFINEMENTS = 2
+REFINEMENTS = 2  # Of a cage, until an extraordinary vertex has no other one in the faces around it
 # Faces whose control points are farther from the vertex than this are holes, in lengths of the shortest edge there.
 FAR = 4
-# Extents of a flat cage count as this.
-SMALLEST = 1e-300
+# Sizes of a cage that stands before a camera, the largest first, and what stays free at each side of the picture.
+SCALES, MARGIN = np.geomspace(4, 0.4, 100), 0.04
+SMALLEST = 1e-300  # What the size of a cage without one counts as
 
 
 def load_stage(name: str, **parameters: str | float) -> mi.Scene:
@@ -77,13 +77,9 @@ def render(scene: mi.Scene, options: FigureOptions, name: str) -> NDArray[np.flo
 
 def _parts(spp: int, most: int) -> list[int]:
     """Split samples per pixel into powers of 4: stratified samplers can spread such numbers evenly over a pixel."""
-    parts = []
-    while spp:
-        size = 1
-        while 4 * size <= min(spp, most):
-            size *= 4
-        parts.append(size)
-        spp -= size
+    parts: list[int] = []
+    while rest := spp - sum(parts):
+        parts.append(4 ** ((max(min(rest, most), 1).bit_length() - 1) // 2))
     return parts
 
 
@@ -103,7 +99,7 @@ def draw_picture(
     figure.set_figheight(HEIGHT * figure.get_figwidth())
     for column in columns:
         axis.axvline(column - 0.5, color="white")
-    return write_figure(replace(options, resolution=pixels.shape[1]), name, figure, [pixels], layouts=0, **metadata)
+    return write_figure(options, name, figure, [pixels], pixels=pixels.shape[1], layouts=0, **metadata)
 
 
 def on_white(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:
@@ -158,13 +154,8 @@ def grid_triangles(segments: int, count: int) -> NDArray[np.integer]:
     return np.concatenate([split_quads(quad.reshape(-1, 4)) for quad in np.stack(quads, axis=-1)])
 
 
-def render_panels(
-    options: FigureOptions,
-    axes: Any,
-    # By titles of the panels; a second line of a title stands below the panel
-    scenes: Iterable[tuple[str, mi.Scene]],
-) -> list[NDArray[np.float32]]:
-    """Render a scene in each panel; returns the pictures."""
+def render_panels(options: FigureOptions, axes: Any, scenes: Iterable[tuple[str, Any]]) -> list[NDArray[np.float32]]:
+    """Render a scene in each panel, by titles whose second line stands below the panel; returns the pictures."""
     rendered = []
     for (title, scene), axis in zip(scenes, axes.flat, strict=True):
         name, _, caption = title.partition("\n")
@@ -174,14 +165,15 @@ def render_panels(
 
 
 def project(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Pixel coordinates ``(.., 2)`` of world points ``(.., 3)``, for a square image."""
+    """Pixel coordinates ``(.., 2)`` of world points ``(.., 3)``."""
     parameters = mi.traverse(sensor)
     camera = _in_camera(sensor, points)
     # Mitsuba's cameras look along +z, with x to the left and y up. An orthographic camera sees x and y from -1 to 1.
     half_width = np.ones_like(camera[..., 2:])
     if "x_fov" in parameters:
         half_width = camera[..., 2:] * np.tan(np.radians(float(np.array(parameters["x_fov"]).item()) / 2))
-    return (1 - camera[..., :2] / half_width) / 2 * int(sensor.film().crop_size()[0])
+    size = np.array(sensor.film().crop_size())
+    return (size - camera[..., :2] / half_width * size[0]) / 2
 
 
 def visible(scene: mi.Scene, points: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -212,38 +204,48 @@ def camera_matrix(sensor: mi.Sensor) -> NDArray[np.float64]:
 
 
 def _in_camera(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.float64]:
-    to_camera = np.linalg.inv(camera_matrix(sensor))
-    return points @ to_camera[:3, :3].T + to_camera[:3, 3]
+    return moved(points, np.linalg.inv(camera_matrix(sensor)))
 
 
-def around_vertices(
-    path: Path,  # File of a Catmull-Clark cage
-    most: int,  # Number of vertices
-    like: tuple[NDArray[np.float64], ...],  # (3,), (3, 3), (): as `frame` returns it
-) -> dict[int, ControlCage]:
-    """A cage, moved, turned and scaled, with each of its extraordinary vertices of the lowest valences at a frame.
+def around_vertices(path: Path, most: int) -> dict[str, ControlCage]:
+    """A Catmull-Clark cage, numbered from each of some extraordinary vertices on, those of the lowest valences.
 
-    That is vertex 0, the first faces lie around it, and each of them begins with it. Valences are the keys.
+    That is vertex 0, the first faces lie around it, and each of them begins with it. Keys name the vertices. Centres of
+    faces are vertices of the refined cage; they count only if there are no others.
     """
-    cage = read(path)
-    fans = _isolated_fans(cage)
-    for _ in range(REFINEMENTS):
-        if not fans:
-            cage = cage.refined()
-            fans = _isolated_fans(cage)
+    cage, name = read(path), "valence"
+    count = cage.vertex_count
+    for refinement in range(REFINEMENTS + 1):
+        cage = cage.refined() if refinement else cage
+        if fans := _isolated_fans(cage, count):
+            break
+    else:
+        fans, name = _isolated_fans(cage, cage.vertex_count), "centre of a face of"
     if not fans:
         raise FigureError(f'"{path}" has no extraordinary vertex inside of its surface and apart from creases')
-    cages, (to, to_axes, to_length) = {}, like
-    for valence in sorted(fans)[:most]:
-        numbered = _numbered(cage, fans[valence])
-        point, axes, length = frame(LimitSurface(numbered))
-        moved = (numbered.positions - point) @ axes @ to_axes.T * (to_length / length) + to
-        cages[valence] = numbered.with_positions(moved)
-    return cages
+    return {f"{name} {valence}": _numbered(cage, fans[valence]) for valence in sorted(fans)[:most]}
+
+
+def motion(old: tuple[NDArray[np.float64], ...], new: tuple[NDArray[np.float64], ...]) -> NDArray[np.float64]:
+    """The map ``(4, 4)`` that moves, turns and scales one frame to another, as `frame` returns them."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = new[1] @ old[1].T * (new[2] / old[2])
+    matrix[:3, 3] = new[0] - matrix[:3, :3] @ old[0]
+    return matrix
+
+
+def moved(points: NDArray[np.floating], matrix: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Points ``(.., 3)`` after an affine map ``(4, 4)``."""
+    return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3], dtype=np.float64)
 
 
 def read(path: Path) -> ControlCage:
-    """Read a cage, which has to be of Catmull-Clark surfaces."""
+    """Read a cage, which has to be of Catmull-Clark surfaces. Warns about it the first time only."""
+    return _read(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=1)
+def _read(path: Path, _modified: int) -> ControlCage:
     cage = ControlCage.from_file(path)
     if cage.scheme not in (None, "catmull_clark"):
         raise FigureError(f'"{path}" names the scheme {cage.scheme}; expected catmull_clark')
@@ -259,12 +261,14 @@ def frame(surface: LimitSurface, face: int = 0, corner: int = 0) -> tuple[NDArra
     return samples.p[0], np.stack([along, np.cross(normal, along), normal], axis=1), length
 
 
-def fitted(cage: ControlCage, low: NDArray[np.floating], high: NDArray[np.floating]) -> ControlCage:
-    """The cage, scaled into a box, in its middle and on its ground (least z)."""
+def in_view(cage: ControlCage, sensor: mi.Sensor) -> ControlCage:
+    """The cage, standing on the ground below the origin, as large as the camera sees it whole."""
     least, most = cage.positions.min(axis=0), cage.positions.max(axis=0)
-    scale = ((high - low) / np.maximum(most - least, SMALLEST)).min()
-    part = np.array([0.5, 0.5, 0])
-    return cage.with_positions((cage.positions - least - part * (most - least)) * scale + low + part * (high - low))
+    standing = cage.positions - least - np.array([0.5, 0.5, 0]) * (most - least)
+    standing /= max(np.linalg.norm(standing, axis=1).max(), SMALLEST)
+    at = project(sensor, SCALES[:, None, None] * standing) / np.array(sensor.film().crop_size())
+    fits = (np.abs(at - 0.5) < 0.5 - MARGIN).all(axis=(1, 2))
+    return cage.with_positions(SCALES[fits.argmax()] * standing)
 
 
 def in_ball(cage: ControlCage, radius: float) -> ControlCage:
@@ -273,8 +277,8 @@ def in_ball(cage: ControlCage, radius: float) -> ControlCage:
     return cage.with_positions(centred * (radius / max(np.linalg.norm(centred, axis=1).max(), SMALLEST)))
 
 
-def _isolated_fans(cage: ControlCage) -> dict[int, NDArray[np.integer]]:
-    """Half-edges around an extraordinary vertex of each valence whose faces are regular otherwise."""
+def _isolated_fans(cage: ControlCage, end: int) -> dict[int, NDArray[np.integer]]:
+    """Half-edges around an extraordinary vertex before ``end``, of each valence, whose faces are regular otherwise."""
     topology, contents = cage.topology, cage.contents
     if (cage.face_sizes != 4).any():
         return {}
@@ -284,7 +288,7 @@ def _isolated_fans(cage: ControlCage) -> dict[int, NDArray[np.integer]]:
     is_apart = is_irregular[topology.face_vertices.reshape(-1, 4)].sum(axis=1) == 1
     offsets, half_edges = topology.vertex_fans
     fans: dict[int, NDArray[np.integer]] = {}
-    for vertex in np.flatnonzero(is_irregular & ~is_tagged & (np.diff(offsets) > 0)):
+    for vertex in np.flatnonzero((is_irregular & ~is_tagged & (np.diff(offsets) > 0))[:end]):
         fan = half_edges[offsets[vertex] : offsets[vertex + 1]]
         if is_apart[topology.face[fan]].all():
             fans.setdefault(len(fan), fan)

@@ -1,7 +1,4 @@
-"""Reflection lines across a corner of a subdivided cube, by exact normals and by those of other methods.
-
-The others are a refined mesh, and OpenSubdiv and Blender where their programs are found.
-"""
+"""Reflection lines across a corner of a cube by exact normals, a refined mesh, and OpenSubdiv and Blender if found."""
 
 from __future__ import annotations
 
@@ -16,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.named_cages import cube
+from ..messages import print_remark
 from ..regression.scene import render_pixels
 from ..regression.tiers import normal_angle
 from ..surface import LimitSurface
@@ -52,7 +50,9 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
     stage = staging.load_stage("zebra", resolution=options.resolution, fov=FIELD_OF_VIEW)
     surface, level, at = LimitSurface(cube()), FINE_LEVEL, (CORNER_FACE, CORNER)
     if options.cage:
-        (cage,) = staging.around_vertices(options.cage, 1, staging.frame(surface, *at)).values()
+        (cage,) = staging.around_vertices(options.cage, 1).values()
+        to_corner = staging.motion(staging.frame(LimitSurface(cage)), staging.frame(surface, *at))
+        cage = cage.with_positions(staging.moved(cage.positions, to_corner))
         surface, level, at = LimitSurface(cage), OWN_LEVEL, (0, 0)
     shapes, titles = _shapes(surface.cage, level)
     stripes = _stripes(stage.sensors()[0], STRIPES)
@@ -83,7 +83,7 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
         for colour, line in (("white", 2), (RING, 1)):
             axis.plot(*corner, "o", markersize=5, mfc="none", mec=colour, mew=line)
     metadata: dict[str, Any] = {"pictures": titles, "level": LEVEL, "rate": 2**level, "stripes": STRIPES}
-    return write_figure(options, "zebra", figure, list(pixels.values()), **metadata)
+    return write_figure(options, "zebra", figure, list(pixels.values()), cage="cube", **metadata)
 
 
 def _shapes(cage: ControlCage, level: int) -> tuple[dict[str, Any], dict[str, tuple[str, str]]]:
@@ -91,20 +91,24 @@ def _shapes(cage: ControlCage, level: int) -> tuple[dict[str, Any], dict[str, tu
     exact, refined = staging.limit_surface(cage, 2**level, MIRROR), cage
     for _ in range(LEVEL):
         refined = refined.refined()
-    quads = refined.face_vertices.reshape(-1, 4)[~refined.is_hole]
+    quads, own_quads = (each.face_vertices.reshape(-1, 4)[~each.is_hole] for each in (refined, cage))
     # Mitsuba averages its normals at the vertices.
     shapes = {"exact": exact, "mesh": staging.make_mesh(refined.positions, staging.split_quads(quads), MIRROR)}
     averaged = f"level {LEVEL},\naveraged normals"
     titles = {"exact": ("This package", "exact\nnormals"), "mesh": ("Refined mesh", averaged)}
-    if program := osd_peer():
+    tagged = [*cage.contents.creases[:, :2].ravel(), *cage.contents.corners[:, 0]]
+    if is_tagged := bool(np.isin(own_quads, tagged).any()):
+        print_remark("pictures of OpenSubdiv and Blender are left out: they would lack the cage's creases")
+    if not is_tagged and (program := osd_peer()):
         # A grid as fine as that of the exact surface, for each face alone
         uv, shown = staging.grid_points(np.linspace(0, 1, 2**level + 1)), np.flatnonzero(~cage.is_hole)
         points, normals = osd_samples(program, cage, shown[:, None], uv, "bfr", OPENSUBDIV_LEVEL)
         triangles = staging.grid_triangles(2**level, len(shown))
         shapes["opensubdiv"] = staging.make_mesh(points, triangles, MIRROR, vertex_normals=normals)
         titles["opensubdiv"] = ("OpenSubdiv", f"level {OPENSUBDIV_LEVEL},\nown normals")
-    # Blender has no holes.
-    if not len(cage.holes) and (program := blender()):
+    if len(cage.holes):
+        print_remark("the picture of Blender is left out: it has no holes, such as those far from the vertex")
+    elif not is_tagged and (program := blender()):
         points, normals, quads, version = blender_mesh(program, cage, level)
         shapes["blender"] = staging.make_mesh(points, staging.split_quads(quads), MIRROR, vertex_normals=normals)
         titles["blender"] = (f"Blender {version}", f"level {level},\naveraged normals")
