@@ -210,7 +210,7 @@ def test_every_writer_tells_of_a_full_disk_and_leaves_what_was_there(tmp_path, n
             mi.util.convert_to_bitmap(pixels, uint8_srgb=False).write(str(beside))
 
     def draw(path):
-        draw_picture(FigureOptions(tmp_path, formats=("png",)), path.stem, pixels)
+        draw_picture(FigureOptions(tmp_path, formats=("png",)), path.stem, pixels, cage="none")
 
     writers = {
         "a.exr": lambda path: write_exr(path, pixels),

@@ -6,7 +6,6 @@ import platform
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias
 
@@ -147,6 +146,8 @@ def environment(variant: str) -> dict[str, str]:
 
 
 def _processor() -> str:
+    from pathlib import Path
+
     # Code for another processor may add in another order. On Linux, `platform` does not know the model.
     information = Path("/proc/cpuinfo")
     name = _first_of(information.read_text(encoding="utf-8", errors="replace")) if information.is_file() else ""

@@ -19,10 +19,10 @@ ROUNDING = 1e-14
 
 
 def test_tips_keep_fewer_levels_as_pieces_where_these_would_take_too_much_memory(monkeypatch):
-    surface = LimitSurface(extraordinary(5))
+    # A valence of no other test, of which nothing keeps the table.
+    surface = LimitSurface(extraordinary(13))
 
     def made(levels=3):
-        # Made anew each time, as nothing keeps it.
         cage = surface.cage
         table = PieceTable.build(surface.patches, cage.cut_mesh.vertex, cage.vertex_count, levels)
         return table.piece_levels, PACKET * piece_packets(16) * table.piece_count

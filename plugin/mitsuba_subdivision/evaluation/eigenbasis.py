@@ -193,9 +193,6 @@ def _subspace(
     Where the eigenvectors are dependent, it is computed by block inverse iteration.
     """
     vectors, count = eigenvectors[:, members], len(members)
-    if count == 1:
-        # A simple eigenvalue; of a real matrix it is real, and so is its unit vector.
-        return vectors.real
     left, singular, _ = np.linalg.svd(np.hstack([vectors.real, vectors.imag]), full_matrices=False)
     block: FloatArray = left[:, :count]
     if singular[count - 1] >= DEPENDENT:

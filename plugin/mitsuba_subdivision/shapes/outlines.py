@@ -35,5 +35,5 @@ def turn_to_seen(mesh: mi.Mesh, ss: mi.SilhouetteSample3f, active: Mask) -> None
     along = dr.select(ss.projection_index == 0, u, dr.select(ss.projection_index == 1, v, 1 - v))
     seen = seen_edges(mesh, edges, ss.d, active & (ss.pdf > 0))
     along = dr.select(seen == edges, along, 1 - along)
-    turned = mesh.sample_precomputed_silhouette(ss.p - ss.d, seen, along, active)
+    turned = mesh.sample_precomputed_silhouette(mi.Point3f(ss.p - ss.d), seen, along, active)
     ss.prim_index, ss.uv, ss.projection_index = turned.prim_index, turned.uv, seen % 3
