@@ -6,6 +6,8 @@ samples either triangle. Exact shading needs the one that is seen: at the other 
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 
@@ -35,5 +37,6 @@ def turn_to_seen(mesh: mi.Mesh, ss: mi.SilhouetteSample3f, active: Mask) -> None
     along = dr.select(ss.projection_index == 0, u, dr.select(ss.projection_index == 1, v, 1 - v))
     seen = seen_edges(mesh, edges, ss.d, active & (ss.pdf > 0))
     along = dr.select(seen == edges, along, 1 - along)
-    turned = mesh.sample_precomputed_silhouette(mi.Point3f(ss.p - ss.d), seen, along, active)
+    p: Any = ss.p  # Mitsuba's stub lacks the subtraction.
+    turned = mesh.sample_precomputed_silhouette(p - ss.d, seen, along, active)
     ss.prim_index, ss.uv, ss.projection_index = turned.prim_index, turned.uv, seen % 3
