@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from .schemes import SchemeError
     from .shapes.derivatives import loss_of_views
     from .shapes.parameters import pixel_error_for
-    from .studio import render_denoised, studio_scene
+    from .studio import render_denoised, studio_scene, weigh_lights
     from .surface import LimitSurface, SurfaceSamples
     from .tessellation.vertex_table import Tessellation, VertexMatrices
 
@@ -66,6 +66,7 @@ __all__ = [
     "studio_scene",
     "upload",
     "usd_scene",
+    "weigh_lights",
 ]
 
 # Imported when first used, so that a scene without subdivision surfaces does not wait for them.
@@ -82,7 +83,7 @@ _NAMES = {
     ".schemes": ("SchemeError", "register_scheme"),
     ".shapes.derivatives": ("loss_of_views",),
     ".shapes.parameters": ("pixel_error_for",),
-    ".studio": ("render_denoised", "studio_scene"),
+    ".studio": ("render_denoised", "studio_scene", "weigh_lights"),
     ".surface": ("LimitSurface", "SurfaceSamples"),
     ".tessellation.vertex_table": ("Tessellation", "VertexMatrices"),
     "mitsuba_usd": ("usd_scene",),

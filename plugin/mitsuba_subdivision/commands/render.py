@@ -30,7 +30,7 @@ from ..regression.tiers import Tolerances
 from ..shapes.parameter_table import SHADINGS
 from ..studio.animation import FrameRange, StillPicture, Turntable
 from ..studio.cage_scenes import CageScenes
-from ..studio.picture import denoised, require_denoiser, shading_for
+from ..studio.picture import denoised, require_denoiser, shading_for, weigh_lights
 from ..studio.saving import save_scene
 from ..studio.studio_entries import DEFAULT_VIEW, UP_AXES, VIEWS, Environment, Look, sampler, variant_in_use
 from ..variants import set_variant, threads_set
@@ -362,6 +362,7 @@ def _render_picture(
     for part, loaded in enumerate(scenes):
         seed = (options.seed * count + part) % 2**32
         with threads_set(options.threads):
+            weigh_lights(loaded.scene, loaded.sensor_index)
             image = render_image(loaded, spp or loaded.sensor.sampler().sample_count(), seed)
             if options.denoise:
                 # Each by itself, as its albedo and normals are those of its time.

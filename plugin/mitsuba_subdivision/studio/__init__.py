@@ -13,6 +13,7 @@ from .picture import (
     segments_for,
     shading_for,
     triangles_for,
+    weigh_lights,
 )
 from .studio_entries import (
     DEFAULT_SIZE,
@@ -58,4 +59,5 @@ __all__ = [
     "studio_scene",
     "triangles_for",
     "variant_in_use",
+    "weigh_lights",
 ]
