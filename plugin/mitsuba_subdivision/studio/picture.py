@@ -32,9 +32,10 @@ FEW_TRIANGLES = 20_000
 # Samples per pixel of albedo and normals, which take one ray each: enough for smooth edges, and for little noise where
 # a lens blurs them. Measured up to 256, more change nothing.
 AUXILIARY_SPP = 64
-# Least number of lights that are weighed, the least weight of one as a part of their sum, and rays for each: as many as
-# 640 by 480 pixels at a quarter of their size have with two samples.
-LEAST_LIGHTS, LEAST_WEIGHT, SCOUTS = 8, 0.03, 2 * 160 * 120
+# Lights that are weighed: so many, the mean square of whose contributions is so many squares of their mean. For two or
+# equal ones, equal choices are better. Then the least weight as a part of their sum, and rays for each: as many as 640 by
+# 480 pixels at a quarter of their size have with two samples.
+LEAST_LIGHTS, LEAST_UNEVEN, LEAST_WEIGHT, SCOUTS = 3, 1.3, 0.03, 2 * 160 * 120
 # Of the integrator `aov`; the last six channels of its film.
 _AUXILIARY = "albedo:albedo,normal:sh_normal"
 
@@ -144,13 +145,14 @@ def pixels_of_boxes(corners: NDArray[np.float64], outline: SceneNode, near_clip:
 def weigh_lights(scene: mi.Scene, sensor: int = 0) -> bool:
     """Choose lights as often as they matter in a picture, by their ``sampling_weight``; pictures stay unbiased.
 
-    Mitsuba chooses all alike. Here, each light's direct light is rendered alone, with a few rays, and none gets less than
-    0.03 of the sum. Equal choices spread evenly over the samples of a pixel, so that weights pay for many lights only.
+    Mitsuba chooses all alike. Here, each light is rendered alone, as direct light, with a few rays, and none gets below
+    0.03 of the sum. Equal choices spread evenly over the samples of a pixel: weights pay for uneven lights only.
 
     Parameters
     ----------
     scene : mi.Scene
-        Its lights are changed, unless it has fewer than 8, weights of its own or a scalar variant.
+        Its lights are changed, unless they are fewer than 3, nearly even or have weights of their own, or the variant
+        is a scalar one.
     sensor : int
         The sensor of the picture.
 
@@ -179,9 +181,9 @@ def weigh_lights(scene: mi.Scene, sensor: int = 0) -> bool:
         ray, factor = camera.sample_ray_differential(0, sampler.next_1d(), sampler.next_2d(), sampler.next_2d())
         radiance = np.array(factor * direct.sample(scene, sampler, ray)[0])
         seen[number] = np.nan_to_num(radiance, posinf=0.0).mean()
-    is_lit = seen.sum() > 0
-    set_weights(np.maximum(seen / seen.sum(), LEAST_WEIGHT) if is_lit else np.array(before))
-    return bool(is_lit)
+    pays = bool(np.square(seen).mean() > LEAST_UNEVEN * seen.mean() ** 2)
+    set_weights(np.maximum(seen / seen.sum(), LEAST_WEIGHT) if pays else np.array(before))
+    return pays
 
 
 def require_denoiser() -> None:
