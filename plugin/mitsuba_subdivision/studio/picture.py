@@ -33,8 +33,8 @@ FEW_TRIANGLES = 20_000
 # a lens blurs them. Measured up to 256, more change nothing.
 AUXILIARY_SPP = 64
 # Lights that are weighed: so many, the mean square of whose contributions is so many squares of their mean. For two or
-# equal ones, equal choices are better. Then the least weight as a part of their sum, and rays for each: as many as 640 by
-# 480 pixels at a quarter of their size have with two samples.
+# equal ones, equal choices are better. Then the least weight as a part of their sum, and rays for each: as many as 640
+# by 480 pixels at a quarter of their size have with two samples.
 LEAST_LIGHTS, LEAST_UNEVEN, LEAST_WEIGHT, SCOUTS = 3, 1.3, 0.03, 2 * 160 * 120
 # Of the integrator `aov`; the last six channels of its film.
 _AUXILIARY = "albedo:albedo,normal:sh_normal"
