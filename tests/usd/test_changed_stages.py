@@ -47,7 +47,9 @@ def test_a_transparent_picture_over_the_background_is_the_picture(tmp_path):
     # Through a mask, the sky is sampled in two ways.
     opaque, behind = (rendered(write(tmp_path, whole + faded), *more, samples=64) for more in ((), ("--transparent",)))
     np.testing.assert_allclose(behind[..., :3] + (1 - behind[..., 3:]) * 0.5, opaque, atol=0.03)
-    assert 0.35 < np.median(behind[..., 3][(alpha[..., 0] == 0) & (behind[..., 3] > 0.2)]) < 0.45
+    # Rays meet two walls; some pixels lie on their outline.
+    walls = behind[..., 3][(alpha[..., 0] == 0) & (behind[..., 3] > 0.2)]
+    assert np.quantile(walls, 0.75) == pytest.approx(1 - 0.6**2, abs=0.06)
     head = 'renderSettingsPrimPath = "/settings"'
     asks = stages.write(tmp_path, whole + settings, "asks.usda", head=head)
     np.testing.assert_array_equal(rendered(asks), clear)
