@@ -321,7 +321,8 @@ def usd_scene(
     """A whole USD file as a dictionary for ``mi.load_dict``.
 
     Meshes become limit surfaces, or polygons where they are not to be subdivided; with their transforms, instances,
-    materials, lights and the camera. Where the stage has no lights or no camera, it gets those of the studio.
+    materials, lights and the camera. Where the stage has no lights or no camera, it gets those of the studio. Lengths
+    are those of the stage: below 0.01 units, Mitsuba's shadows leak, which `render` avoids by a larger scene.
 
     Parameters
     ----------
