@@ -28,7 +28,6 @@ Mask = Any
 # Parameters (u, v); a point, a direction or a normal, in `algebra` also a list of three arrays; a packet of a table.
 Vector2 = Any
 Vector3 = Any
-Vector4 = Any
 # A 4x4 matrix of Dr.Jit or NumPy, which multiplies points as columns.
 Matrix4 = Any
 # A value of a surface or of a channel, or its derivative: a number, or a vector of two or three components.

@@ -236,8 +236,8 @@ def piece_packets(monomial_count: int, size: int = 3) -> int:
     return -(-size * monomial_count // PACKET)
 
 
-# A tree takes up to some megabytes at high valences.
-@lru_cache(maxsize=128)
+# Tables read each of their hundreds of trees twice, to count and to upload. A tree of a high valence takes megabytes.
+@lru_cache(maxsize=512)
 def tree_arrays(
     element: PatchTree,
     piece_levels: int = PIECE_LEVELS,  # Number of levels of a tip that are pieces; the others are summed
