@@ -14,12 +14,6 @@ import drjit as dr
 
 from .array_types import Float, Mask, Matrix4, Value, Vector3
 
-# Longest Newton step, in parameters of an element: outside of its element, a polynomial may be far from the surface.
-LONGEST_STEP = 0.5
-# Tolerance of a Newton step's length, in parameters of a piece: a next step would be about as long as the square of
-# this. The second one is for nearest points in double precision, which their derivatives depend on.
-STEP_TOLERANCE, STEP_TOLERANCE_DOUBLE = 3e-4, 1e-7
-
 
 def dot(a: Sequence[Float], b: Sequence[Float]) -> Float:
     """Scalar product."""

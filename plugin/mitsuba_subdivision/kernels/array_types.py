@@ -6,11 +6,13 @@ array has a number or a vector for each lane; inactive lanes read zeros and writ
 
 from __future__ import annotations
 
+import gc
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import wraps
 from typing import Any
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 import drjit as dr
 import numpy as np
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..device_arrays import mapped
 from ..llvm import require_llvm
+from ..mesh.shared import SharedArray
 
 # A real number: a parameter u or v, a distance, a weight.
 Float = Any
@@ -43,6 +46,61 @@ NO_CONFLICTS = dr.ReduceMode.NoConflicts
 
 # Arrays that each thread has computed, by `LaterArrays`.
 _of_thread = threading.local()
+# Prefixes of modules whose objects contain Dr.Jit arrays.
+_PACKAGE = __name__.partition(".")[0]
+_PACKAGES = (f"{_PACKAGE}.kernels.", f"{_PACKAGE}.shapes.")
+# Held while a method is `replayed`.
+_replaying = threading.Lock()
+
+
+def replayed(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorate a method to record its kernels, and to run these again without tracing, which takes far longer.
+
+    For methods of arrays without derivatives, whose results depend on nothing else but the arrays of the object. A
+    method that is called within another one, within a frozen function, or outside the main thread, is traced.
+    """
+
+    @wraps(method)
+    def call(self: Any, *arguments: Any) -> Any:
+        is_main = threading.current_thread() is threading.main_thread()
+        if not is_main or dr.flag(dr.JitFlag.FreezingScope) or not _replaying.acquire(blocking=False):
+            return method(self, *arguments)
+        was_enabled = gc.isenabled()
+        try:
+            # Freeing a scene while a function is recorded ends the process.
+            gc.disable()
+            recordings = vars(self).setdefault("_recordings", {})
+            if method not in recordings:
+                # Without a reference cycle: objects that the collector frees may end the process later.
+                this = ref(self)
+                recording = dr.freeze(lambda _, *arguments: method(this(), *arguments))
+                recordings[method] = recording, list(arrays_in(vars(self), set()))
+            recording, arrays = recordings[method]
+            return recording(arrays, *arguments)
+        finally:
+            _replaying.release()
+            if was_enabled:
+                gc.enable()
+
+    return call
+
+
+def arrays_in(value: Any, seen: set[int]) -> Iterator[Any]:
+    """Iterate over the Dr.Jit arrays in a value, in containers, and in objects of kernels and shapes, each once."""
+    if id(value) in seen:
+        return
+    seen.add(id(value))
+    kind = type(value)
+    if dr.is_array_v(kind):
+        if dr.is_jit_v(kind):
+            yield value
+    elif isinstance(value, (dict, list, tuple)):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from arrays_in(item, seen)
+    elif isinstance(value, SharedArray) or (kind.__module__.startswith(_PACKAGES) and hasattr(value, "__dict__")):
+        for name in getattr(kind, "UPLOADED_LATER", ()):
+            getattr(value, name)
+        yield from arrays_in(vars(value), seen)
 
 
 class LaterArrays:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from .algebra import LONGEST_STEP, STEP_TOLERANCE, dot, over, step_along
+from .algebra import dot, over, step_along
 from .array_types import ArrayTypes, Float, Index, Mask, Vector3
 from .locations import ElementWalk, Location
 from .piece_kernel import PatchValues, Piece
@@ -26,13 +26,15 @@ from .piece_kernel import PatchValues, Piece
 # Maximum number of rounds for each aim, and number of Newton steps in a round.
 ROUNDS = 12
 STEPS_IN_ROUND = 3
+# Longest Newton step, in parameters of an element: outside of its element, a polynomial may be far from the surface.
+LONGEST_STEP = 0.5
+# Tolerance of a Newton step's length, in parameters of a piece: a next step would be about as long as its square.
+STEP_TOLERANCE = 3e-4
 # Largest overshoot of a border by rounding, in parameters of a piece. A larger one means that the border stops the
 # search.
 BEYOND_BORDER = 1e-6
 # Successive aims of the search; the `kind` of a hit is the aim that succeeded.
 ON_LINE, ON_NORMAL, MISSED = range(3)
-# Added to an aim when the search has ended.
-_ENDED = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +57,37 @@ class Lines:
         return dr.select(self.hold, du, 0), dr.select(self.hold, dv, 0)
 
 
+# Not frozen: Dr.Jit assigns the fields of a loop's state.
+@dataclass(eq=False)
+class _Search:
+    """State of the search for the hits of `line_hits`."""
+
+    aim: Index
+    is_done: Mask
+    rounds: Index  # Number of rounds with this aim
+    # Non-zero after a hit on the wrong side: the next step leads along the surface, in the direction of the line if
+    # positive, or against it
+    side: Float
+    is_held: Mask  # Lanes that a border has stopped in the last round
+    d: Vector3  # Direction of the line, or of the normal
+    location: Location
+    surface: PatchValues  # Without second derivatives
+
+
+@dataclass(eq=False)
+class _Newton:
+    """State of the Newton steps of `piece_hits`."""
+
+    steps_left: Index
+    d: Vector3  # Direction of the line, or of the normal
+    # Sum of the steps
+    u: Float
+    v: Float
+    length: Float  # Of the last step
+    is_along_surface: Mask  # Lanes whose last step was along the surface, towards another hit of the line
+    surface: PatchValues  # Before the last step, without second derivatives
+
+
 def line_hits(
     walk: ElementWalk,  # Elements of the surface
     # Function of a half-edge, u, v, a mask and the row of the half-edge, which returns the piece of the surface
@@ -67,7 +100,7 @@ def line_hits(
     max_distance: Float = dr.inf,  # Maximum distance of the hit from ``p``
     # Wanted sign of the dot product of the normal and ``d``; 0 for either. A line that enters a ball also leaves it,
     # and Newton's method may converge to either hit.
-    facing: Float = 0,
+    wanted_sign: Float = 0,
 ) -> tuple[Location, Index, PatchValues]:
     """Intersect lines with a surface near given locations. Arguments must be detached.
 
@@ -76,17 +109,20 @@ def line_hits(
     """
     types = walk.types
 
-    def search(aim, round_count, side, is_held, d, half_edge, u, v, *_):
-        row = walk.row(half_edge, active)
-        piece = piece_at(half_edge, u, v, active, row)
-        turns = (aim == ON_NORMAL) & (round_count == 0)
-        d, (du, dv), length, is_along_surface, surface = piece_hits(
-            types, piece, p, d, is_still=is_held | (aim == MISSED), turns=turns, side=side, facing=facing
+    def next_round(last: _Search) -> tuple[_Search]:
+        here, aim = last.location, last.aim
+        row = walk.row(here.half_edge, active)
+        piece = piece_at(here.half_edge, here.u, here.v, active, row)
+        is_still, turns = last.is_held | (aim == MISSED), (aim == ON_NORMAL) & (last.rounds == 0)
+        newton = piece_hits(
+            types, piece, p, last.d, is_still=is_still, turns=turns, side=last.side, wanted_sign=wanted_sign
         )
+        surface, d = newton.surface, newton.d
         offset = p - surface.value
-        unclamped = Location(half_edge, u + du, v + dv)
-        is_finite = dr.isfinite(du) & dr.isfinite(dv)
+        unclamped = Location(here.half_edge, here.u + newton.u, here.v + newton.v)
+        is_finite = dr.isfinite(newton.u) & dr.isfinite(newton.v)
         target = walk.carried(unclamped, active & is_finite, row)
+        du, dv = target.u - here.u, target.v - here.v
 
         # Tolerance of the step's length, in parameters of a piece: rounding errors exceed `STEP_TOLERANCE` next to
         # extraordinary points.
@@ -95,40 +131,47 @@ def line_hits(
         last_step = dr.clip(
             over(types.rounding * coordinate_size * piece.magnification, longest_derivative), STEP_TOLERANCE, 1
         )
-        parameter_change = dr.maximum(dr.abs(target.u - u), dr.abs(target.v - v))
-        has_settled = is_finite & (dr.minimum(length, parameter_change) * piece.magnification < last_step)
+        change = dr.maximum(dr.abs(du), dr.abs(dv))
+        has_settled = is_finite & (dr.minimum(newton.length, change) * piece.magnification < last_step)
         # This is also true if the other side is unreachable, beyond a crease.
-        is_wrong_side = has_settled & (aim == ON_LINE) & (dot(surface.normal, d) * facing < 0)
-        converges = has_settled & ~is_wrong_side & ~is_along_surface
-        converges &= (target.half_edge == half_edge) & piece.is_inside(target.u - u, target.v - v, last_step)
+        is_wrong_side = has_settled & (aim == ON_LINE) & (dot(surface.normal, d) * wanted_sign < 0)
+        converges = has_settled & ~is_wrong_side & ~newton.is_along_surface
+        converges &= (target.half_edge == here.half_edge) & piece.is_inside(du, dv, last_step)
         converges &= dr.sqrt(dot(offset, offset)) <= max_distance
         # At a border, successive steps overshoot by nearly the same amount.
         overshoot = dr.maximum(dr.abs(target.u - unclamped.u), dr.abs(target.v - unclamped.v)) * piece.magnification
-        holds = converges & (overshoot > BEYOND_BORDER)
+        is_held = converges & (overshoot > BEYOND_BORDER)
 
-        ends = is_held | (aim == MISSED) | (converges & ~holds)
-        fails = (round_count + 1 >= ROUNDS) & ~(ends | holds)
+        is_done = is_still | (converges & ~is_held)
+        fails = (last.rounds + 1 >= ROUNDS) & ~(is_done | is_held)
         new_side = dr.select(dot(offset, d) < 0, types.float(-1), types.float(1))
-        side = dr.select(is_along_surface, side, dr.select(is_wrong_side, new_side, 0))
-        side = dr.select(fails, 0, side)
+        side = dr.select(newton.is_along_surface, last.side, dr.select(is_wrong_side, new_side, 0))
         # A point on the border that stops the search is not on its line.
-        reached_aim = dr.select(is_held & (aim == ON_LINE), types.index(ON_NORMAL), aim)
-        aim = dr.select(ends, reached_aim + _ENDED, dr.select(fails, aim + 1, aim))
-        target = Location(half_edge, u, v).chosen(is_finite, target).chosen(fails, location)
-        round_count = dr.select(fails, 0, round_count + 1)
-        return aim, round_count, side, holds, d, target.half_edge, target.u, target.v, *surface.first_order
+        aim = dr.select(last.is_held & (aim == ON_LINE), types.index(ON_NORMAL), dr.select(fails, aim + 1, aim))
+        return (
+            _Search(
+                aim,
+                is_done,
+                dr.select(fails, 0, last.rounds + 1),
+                dr.select(fails, 0, side),
+                is_held,
+                d,
+                here.chosen(is_finite, target).chosen(fails, location),
+                PatchValues(*surface.first_order),
+            ),
+        )
 
-    zero = types.float(0)
-    start = (types.index(ON_LINE), types.index(0), zero, zero > 1, d, location.half_edge, location.u, location.v)
-    aim, _, _, _, _, half_edge, u, v, *values = dr.while_loop(
-        (*start, *(d * 0 for _ in range(4))),
-        lambda aim, *_: active & (aim < _ENDED),
-        search,
+    no, zero = types.float(0) > 1, types.float(0)
+    start = _Search(types.index(ON_LINE), no, types.index(0), zero, no, d, location, _no_values(d))
+    (end,) = dr.while_loop(
+        (start,),
+        lambda state: active & ~state.is_done,
+        next_round,
         mode="symbolic",
         label="line_intersection",
     )
-    from_first, corner = walk.from_first(Location(half_edge, u, v), active)
-    return from_first, aim & (_ENDED - 1), PatchValues(*values).seen_from_first(walk, corner)
+    from_first, corner = walk.from_first(end.location, active)
+    return from_first, end.aim, end.surface.seen_from_first(walk, corner)
 
 
 def piece_hits(
@@ -139,24 +182,18 @@ def piece_hits(
     *,
     is_still: Mask = False,  # Lanes that take no step
     turns: Mask = False,  # Lanes that replace the direction of the line by the normal
-    # Non-zero if the last hit was on the wrong side. From a point that faces the wrong way, a step then leads along the
-    # surface, in the direction of the line if positive, or against it.
-    side: Float = 0,
-    facing: Float = 0,  # As for `line_hits`
+    side: Float = 0,  # As in `_Search`
+    wanted_sign: Float = 0,  # As for `line_hits`
     steps: int = STEPS_IN_ROUND,
-) -> tuple[Vector3, tuple[Float, Float], Float, Mask, PatchValues]:
-    """Intersect lines with the polynomial of a piece, continued beyond it, by some Newton steps from its parameters.
+) -> _Newton:
+    """Intersect lines with the polynomial of a piece, continued beyond it, by Newton steps from its parameters."""
 
-    Returns the directions of the lines; the sum of the steps by u and v; the length of the last step; lanes whose last
-    step was along the surface, towards another hit of the line; and the surface before the last step.
-    """
-
-    def step(steps_left, d, u, v, length, is_along_surface, *_):
-        surface = piece.values(u, v)
-        is_first = steps_left > steps
-        d = dr.select(is_first & turns, surface.normal, d)
-        is_along_surface |= is_first & (side != 0) & (dot(surface.normal, d) * facing < 0)
-        is_last = (steps_left == 1) | is_still
+    def next_step(last: _Newton) -> tuple[_Newton]:
+        surface = piece.values(last.u, last.v)
+        is_first = last.steps_left > steps
+        d = dr.select(is_first & turns, surface.normal, last.d)
+        is_along_surface = last.is_along_surface | (is_first & (side != 0) & (dot(surface.normal, d) * wanted_sign < 0))
+        is_last = (last.steps_left == 1) | is_still
         du, dv = step_along(
             dr.select(is_along_surface, side * d, p - surface.value),
             dr.select(is_along_surface, surface.normal, d),
@@ -164,22 +201,20 @@ def piece_hits(
             surface.dv,
         )
         size = dr.maximum(dr.abs(du), dr.abs(dv))
-        factor = LONGEST_STEP / dr.select(is_along_surface, size, dr.maximum(size, LONGEST_STEP))
-        factor = dr.select(is_last, 0, factor)
-        length = dr.select(is_last, length, size)
-        u, v = dr.fma(du, factor, u), dr.fma(dv, factor, v)
+        longest: Float = dr.select(is_along_surface, size, dr.maximum(size, LONGEST_STEP))
+        factor = dr.select(is_last, 0, LONGEST_STEP / longest)
+        length = dr.select(is_last, last.length, size)
+        u, v = dr.fma(du, factor, last.u), dr.fma(dv, factor, last.v)
         # After a short step, only evaluate the surface there.
-        is_short = (size * piece.magnification < STEP_TOLERANCE) & (steps_left > 1)
-        steps_left = dr.select(is_last | is_along_surface, 0, dr.select(is_short, 1, steps_left - 1))
-        return steps_left, d, u, v, length, is_along_surface, *surface.first_order
+        is_short = (size * piece.magnification < STEP_TOLERANCE) & (last.steps_left > 1)
+        left = dr.select(is_last | is_along_surface, 0, dr.select(is_short, 1, last.steps_left - 1))
+        return (_Newton(left, d, u, v, length, is_along_surface, PatchValues(*surface.first_order)),)
 
     zero = types.float(0)
-    start = (types.index(steps + 1), type(d)(d), zero, zero, zero, zero > 1)
-    _, d, u, v, length, is_along_surface, *values = dr.while_loop(
-        (*start, *(d * 0 for _ in range(4))),
-        lambda steps_left, *_: steps_left > 0,
-        step,
-        mode="symbolic",
-        label="newton",
-    )
-    return d, (u, v), length, is_along_surface, PatchValues(*values)
+    start = _Newton(types.index(steps + 1), type(d)(d), zero, zero, zero, zero > 1, _no_values(d))
+    (end,) = dr.while_loop((start,), lambda state: state.steps_left > 0, next_step, mode="symbolic", label="newton")
+    return end
+
+
+def _no_values(vector: Vector3) -> PatchValues:
+    return PatchValues(*(vector * 0 for _ in range(4)))

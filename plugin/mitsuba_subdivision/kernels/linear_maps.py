@@ -32,6 +32,7 @@ from .array_types import (
     Mask,
     Value,
     Vector3,
+    replayed,
 )
 
 if TYPE_CHECKING:
@@ -286,6 +287,7 @@ class CoefficientMap:
         coefficients = self._applied(size, dr.detach(points)) if known is None else known
         return attached(coefficients, points, partial(self._applied, size), partial(self._transposed, size))
 
+    @replayed
     def _applied(self, size: int, points: FloatBuffer) -> FloatBuffer:
         """Coefficients of ``size`` components, from control points of three."""
         types = self._types
@@ -301,6 +303,7 @@ class CoefficientMap:
             self._pieces.write(padded, coefficients, size)
         return coefficients
 
+    @replayed
     def _transposed(self, size: int, gradient: FloatBuffer) -> FloatBuffer:
         """Gradient by the control points, from the gradient by the coefficients."""
         types = self._types

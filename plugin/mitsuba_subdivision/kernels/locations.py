@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from ..tessellation.vertex_table import VertexTable
 
 
-@dataclass(frozen=True, eq=False)
+# Not frozen: Dr.Jit assigns the fields of a loop's state.
+@dataclass(eq=False)
 class Location:
     """Locations on a surface: parameters in an element, seen from one of its half-edges."""
 

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 
 import drjit as dr
 
-from .algebra import LONGEST_STEP, STEP_TOLERANCE, STEP_TOLERANCE_DOUBLE
-from .array_types import Float, Mask, Vector3
+from .array_types import Float, Index, Mask, Vector3
+from .line_intersection import LONGEST_STEP, STEP_TOLERANCE
 from .locations import ElementWalk, Location
 from .piece_kernel import PatchValues, Piece
 
 # Maximum number of Newton steps; about five are usual.
 STEPS = 40
+# Tolerance of a step's length in double precision, as `STEP_TOLERANCE`: derivatives depend on it.
+STEP_TOLERANCE_DOUBLE = 1e-7
 # Factor that shortens a step that has increased the distance; lengths, in parameters of a piece, below which the search
 # stops instead.
 SHORTER, GIVEN_UP_SINGLE, GIVEN_UP_DOUBLE = 0.25, 1e-6, 1e-12
@@ -52,6 +54,20 @@ class NearestPoints:
         return dr.select(self.is_free, free_u, along_u), dr.select(self.is_free, free_v, along_v)
 
 
+# Not frozen: Dr.Jit assigns the fields of a loop's state.
+@dataclass(eq=False)
+class _Descent:
+    """State of the descent of `nearest_locations`."""
+
+    steps_left: Index
+    location: Location  # The nearest one so far
+    squared_distance: Float
+    # The next step, and a factor that shortens it
+    du: Float
+    dv: Float
+    factor: Float
+
+
 def nearest_locations(
     walk: ElementWalk,  # Elements of the surface
     piece_at: Callable[..., Piece],  # Function of a half-edge, u and v, which returns the detached piece
@@ -62,40 +78,38 @@ def nearest_locations(
     types = walk.types
     last_step = STEP_TOLERANCE_DOUBLE if types.is_double else STEP_TOLERANCE
     shortest_step = GIVEN_UP_DOUBLE if types.is_double else GIVEN_UP_SINGLE
-    relative_rounding = types.rounding
 
-    def step(steps_left, half_edge, u, v, squared_distance, du, dv, step_factor, *_):
-        target = Location(half_edge, u + step_factor * du, v + step_factor * dv)
-        location = walk.carried(target)
+    def step(last: _Descent) -> tuple[_Descent]:
+        du, dv = last.factor * last.du, last.factor * last.dv
+        location = walk.carried(Location(last.location.half_edge, last.location.u + du, last.location.v + dv))
         piece = piece_at(location.half_edge, location.u, location.v)
         values = piece.values(derivatives=2)
         offset = values.value - p
-        new_squared = dr.squared_norm(offset)
-        coordinate_size = dr.norm(p) + dr.norm(values.value)
-        improves = new_squared <= squared_distance + relative_rounding * coordinate_size * (
-            dr.sqrt(new_squared) + relative_rounding * coordinate_size
-        )
-        length = dr.maximum(dr.abs(step_factor * du), dr.abs(step_factor * dv)) * piece.magnification
-        is_first = dr.isinf(squared_distance)
-        new_u, new_v, *_ = _step(walk, location, values, offset)
+        squared = dr.squared_norm(offset)
+        rounding = types.rounding * (dr.norm(p) + dr.norm(values.value))
+        improves = squared <= last.squared_distance + rounding * (dr.sqrt(squared) + rounding)
+        length = dr.maximum(dr.abs(du), dr.abs(dv)) * piece.magnification
+        is_first = dr.isinf(last.squared_distance)
+        new_du, new_dv, *_ = _step(walk, location, values, offset)
         is_done = (improves & ~is_first & (length < last_step)) | (~improves & (length < shortest_step))
-        best = Location(half_edge, u, v).chosen(improves, location)
         return (
-            dr.select(is_done, 0, steps_left - 1),
-            *(best.half_edge, best.u, best.v),
-            dr.select(improves, new_squared, squared_distance),
-            dr.select(improves, new_u, du),
-            dr.select(improves, new_v, dv),
-            dr.select(improves, 1, step_factor * SHORTER),
+            _Descent(
+                dr.select(is_done, 0, last.steps_left - 1),
+                last.location.chosen(improves, location),
+                dr.select(improves, squared, last.squared_distance),
+                dr.select(improves, new_du, last.du),
+                dr.select(improves, new_dv, last.dv),
+                dr.select(improves, 1, last.factor * SHORTER),
+            ),
         )
 
     zero = types.float(0)
-    state = (types.index(STEPS), start.half_edge, start.u, start.v, zero + dr.inf, zero, zero, zero + 1)
-    _, half_edge, u, v, *_ = dr.while_loop(
-        state, lambda steps_left, *_: steps_left > 0, step, mode="symbolic", label="nearest_location"
+    begin = _Descent(types.index(STEPS), start, zero + dr.inf, zero, zero, zero + 1)
+    (end,) = dr.while_loop(
+        (begin,), lambda state: state.steps_left > 0, step, mode="symbolic", label="nearest_location"
     )
     # One more step, which is not taken, determines the directions in which the final location may move.
-    location, _ = walk.from_first(Location(half_edge, u, v))
+    location, _ = walk.from_first(end.location)
     values = piece_at(location.half_edge, location.u, location.v).values(derivatives=2)
     _, _, along_u, along_v, is_free = _step(walk, location, values, values.value - p)
     return location, NearestPoints(p, along_u, along_v, is_free)

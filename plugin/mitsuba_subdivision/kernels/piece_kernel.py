@@ -54,7 +54,8 @@ _ONLY_CHILD, _REGULAR, _TIP = map(int, (PartKind.ONLY_CHILD, PartKind.REGULAR, P
 _UNEVEN = int(FrameKind.UNEVEN)
 
 
-@dataclass(frozen=True, eq=False)
+# Not frozen, as `Location` is not.
+@dataclass(eq=False)
 class PatchValues:
     """Value and derivatives of a patch at given parameters."""
 

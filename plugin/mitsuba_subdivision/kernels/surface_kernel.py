@@ -175,9 +175,9 @@ class SurfaceKernel:
         direction, origin = dr.detach(d), dr.detach(o)
         projection = self.at(start, moves=False).p - origin
         projection = origin + direction * (dr.dot(projection, direction) / dr.squared_norm(direction))
-        location, kind, values = self.line_hits(projection, direction, start)
+        location, kind, known = self.line_hits(projection, direction, start)
         lines = Lines(o, d, kind == ON_LINE)
-        points = self.at(location, derivatives=derivatives, constraint=lines, values=values)
+        points = self.at(location, derivatives=derivatives, constraint=lines, known=known)
         along_ray = points.p - o
         t = dr.dot(along_ray, d) / dr.squared_norm(d)
         squared_distance = dr.squared_norm(dr.detach(along_ray - d * t))
@@ -286,8 +286,7 @@ class SurfaceKernel:
         # location is fixed.
         constraint: Lines | NearestPoints | None = None,
         moves: bool = True,  # Whether results are attached to the control points and the displacement
-        # Values at the location, as returned by `line_hits`: saves evaluation where nothing is differentiated
-        values: PatchValues | None = None,
+        known: PatchValues | None = None,  # Values of `line_hits`: save the evaluation where nothing is differentiated
     ) -> SurfacePoints:
         """Evaluate the surface."""
         coefficients = self.coefficients if moves else dr.detach(self.coefficients)
@@ -296,41 +295,25 @@ class SurfaceKernel:
             is_moving = dr.grad_enabled(coefficients, *variables)
             if constraint is not None and not (is_moving or dr.grad_enabled(*constraint.variables)):
                 constraint = None
-            follows = constraint is not None or dr.grad_enabled(location.u, location.v)
-            order = 2 if follows else derivatives
-            if values is None or is_moving or order == 2:
-                u, v = dr.detach(location.u), dr.detach(location.v)
-                piece = self._piece(coefficients, location.half_edge, u, v, active)
-                evaluated = piece.values(derivatives=order)
+            slides = constraint is not None or dr.grad_enabled(location.u, location.v)
+            if known is not None and not (is_moving or slides or derivatives == 2):
+                return _points(location, known)
+            fixed = Location(location.half_edge, dr.detach(location.u), dr.detach(location.v))
+            piece = self._piece(coefficients, fixed.half_edge, fixed.u, fixed.v, active)
+            values = piece.values(derivatives=2 if slides else derivatives)
+            if known is not None and is_moving:
                 # With the known primal values, Dr.Jit omits the evaluation from kernels that only need derivatives.
-                values = evaluated.at_values(values) if values is not None and is_moving else evaluated
-            n = unit(values.normal)
-            points = SurfacePoints(location, values.value, n, values.du, values.dv)
-            if order == 1:
-                return points
-            # If the derivatives of normals are not returned, they need not be differentiable.
-            with dr.suspend_grad(when=derivatives == 1):
-                dn_du, dn_dv = _normal_derivatives(values, n)
-            if derivatives == 2:
-                points = replace(points, dn_du=dn_du, dn_dv=dn_dv)
-            if not follows:
-                return points
-            steps = (location.u, location.v) if constraint is None else constraint.step(values)
-            # Steps of value zero that carry the derivatives of the parameters.
-            du, dv = (dr.replace_grad(self.types.float(0), step) for step in steps)  # type: ignore[func-returns-value]  # The stub is wrong.
-            shifted = values.shifted(du, dv)
-            dp_du, dp_dv = shifted.du, shifted.dv
+                values = values.at_values(known)
+            if not slides:
+                return _points(location, values, derivatives)
+            step = (location.u, location.v) if constraint is None else constraint.step(values)
+            points = _sliding(piece, fixed, values, step, derivatives)
             if isinstance(constraint, Lines) and piece.is_deep is not None:
                 # Derivatives of tangents are unbounded near extraordinary points, and would add noise.
-                dp_du, dp_dv = dr.select(piece.is_deep, values.du, dp_du), dr.select(piece.is_deep, values.dv, dp_dv)
-            n = n + (dr.detach(dn_du) * du + dr.detach(dn_dv) * dv)
-            location = Location(location.half_edge, u + du, v + dv)
-            points = replace(points, location=location, p=shifted.value, n=n, dp_du=dp_du, dp_dv=dp_dv)
-            if derivatives == 1:
-                return points
-            by_u, by_v = differences(lambda du, dv: _normal_derivatives(piece.values(du, dv, 2)), piece.magnification)
-            dn_du, dn_dv = (x + (x_u * du + x_v * dv) for x, x_u, x_v in zip((dn_du, dn_dv), by_u, by_v, strict=True))
-            return replace(points, dn_du=dn_du, dn_dv=dn_dv)
+                dp_du = dr.select(piece.is_deep, values.du, points.dp_du)
+                dp_dv = dr.select(piece.is_deep, values.dv, points.dp_dv)
+                points = replace(points, dp_du=dp_du, dp_dv=dp_dv)
+            return points
 
     def _piece(
         self,
@@ -353,6 +336,37 @@ class SurfaceKernel:
         with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
             piece = partial(self._piece, dr.detach(self.coefficients))
             return line_hits(self.walk, piece, p, d, location, active, **limits)
+
+
+def _points(location: Location, values: PatchValues, derivatives: int = 1) -> SurfacePoints:
+    n = unit(values.normal)
+    changes = _normal_derivatives(values, n) if derivatives == 2 else ()
+    return SurfacePoints(location, values.value, n, values.du, values.dv, *changes)
+
+
+def _sliding(
+    piece: Piece,
+    location: Location,  # Detached
+    values: PatchValues,  # With second derivatives
+    step: tuple[Float, Float],  # Numbers whose derivatives are those of u and v
+    derivatives: int,
+) -> SurfacePoints:
+    """Points attached to parameters that move."""
+    n = unit(values.normal)
+    # If the derivatives of normals are not returned, they need not be differentiable.
+    with dr.suspend_grad(when=derivatives == 1):
+        dn_du, dn_dv = _normal_derivatives(values, n)
+    # Steps of value zero that carry the derivatives of the parameters.
+    du, dv = (dr.replace_grad(piece.kernel.types.float(0), number) for number in step)  # type: ignore[func-returns-value]  # The stub is wrong.
+    shifted = values.shifted(du, dv)
+    n = n + (dr.detach(dn_du) * du + dr.detach(dn_dv) * dv)
+    location = Location(location.half_edge, location.u + du, location.v + dv)
+    points = SurfacePoints(location, shifted.value, n, shifted.du, shifted.dv)
+    if derivatives == 1:
+        return points
+    by_u, by_v = differences(lambda du, dv: _normal_derivatives(piece.values(du, dv, 2)), piece.magnification)
+    dn_du, dn_dv = (x + (x_u * du + x_v * dv) for x, x_u, x_v in zip((dn_du, dn_dv), by_u, by_v, strict=True))
+    return replace(points, dn_du=dn_du, dn_dv=dn_dv)
 
 
 def _normal_derivatives(values: PatchValues, n: Vector3 | None = None) -> tuple[Vector3, Vector3]:

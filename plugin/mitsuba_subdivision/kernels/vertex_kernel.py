@@ -13,7 +13,7 @@ from ..mesh import ragged
 from ..patches.piece_table import PACKET
 from ..tessellation.vertex_table import VertexPolynomials, VertexTable
 from .algebra import AffineMap, Monomials, unit
-from .array_types import NO_CONFLICTS, ArrayTypes, Float, FloatBuffer, Index, IndexBuffer, Matrix4, Vector3
+from .array_types import NO_CONFLICTS, ArrayTypes, Float, FloatBuffer, Index, IndexBuffer, Matrix4, Vector3, replayed
 from .linear_maps import SparseMatrix, WeightBlocks, attached
 
 # Least divisor when `UnitNormal` divides a tangent by its longest component, so that the cross product neither under-
@@ -50,6 +50,11 @@ class VertexKernel:
         """Points and unit normals from detached control points; raises as a call does."""
         if dr.width(control_points) != 3 * self.control_count:
             raise ValueError(coordinates_expected(dr.width(control_points), self.control_count))
+        vertices: tuple[FloatBuffer, FloatBuffer] = self._evaluated(control_points)
+        return vertices
+
+    @replayed
+    def _evaluated(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         padded, buffers = self._padded(control_points), self._buffers()
         for part in self._parts:
             part.evaluate(padded, buffers)
@@ -66,6 +71,7 @@ class VertexKernel:
         vertices: tuple[FloatBuffer, FloatBuffer] = attached((positions, normals), control_points, *derivatives)
         return vertices
 
+    @replayed
     def changes(self, control_points: FloatBuffer, change: FloatBuffer) -> tuple[FloatBuffer, ...]:
         """Directional derivatives of points and normals for a change of the control points; flat, detached."""
         padded, padded_change, buffers = self._padded(control_points), self._padded(change), self._buffers()
@@ -73,6 +79,7 @@ class VertexKernel:
             part.evaluate(padded, buffers, padded_change)
         return self._welded(*buffers)
 
+    @replayed
     def gradient(self, control_points: FloatBuffer, positions: FloatBuffer, normals: FloatBuffer) -> FloatBuffer:
         """Gradient by the control points, from the gradients by points and normals; flat, detached."""
         if self._weld_target is not None:

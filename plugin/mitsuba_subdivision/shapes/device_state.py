@@ -19,13 +19,8 @@ import drjit as dr
 import numpy as np
 
 from ..device_arrays import take_over
-from ..kernels.array_types import FloatBuffer
-from ..mesh.shared import SharedArray
+from ..kernels.array_types import FloatBuffer, arrays_in
 from ..variants import Variant
-
-# Prefixes of modules whose objects contain Dr.Jit arrays.
-_PACKAGE = __name__.partition(".")[0]
-_PACKAGES = (f"{_PACKAGE}.kernels.", f"{_PACKAGE}.shapes.")
 
 
 @contextmanager
@@ -173,22 +168,4 @@ class DeviceState:
 
     def _arrays(self) -> SimpleNamespace:
         self.is_frozen, shape = True, self._shape()
-        return SimpleNamespace(arrays=[] if shape is None else list(_arrays_in(vars(shape), {id(self)})))
-
-
-def _arrays_in(value: Any, seen: set[int]) -> Iterator[Any]:
-    """Iterate over the Dr.Jit arrays in a value, in containers, and in objects of kernels and shapes, each once."""
-    if id(value) in seen:
-        return
-    seen.add(id(value))
-    kind = type(value)
-    if dr.is_array_v(kind):
-        if dr.is_jit_v(kind):
-            yield value
-    elif isinstance(value, (dict, list, tuple)):
-        for item in value.values() if isinstance(value, dict) else value:
-            yield from _arrays_in(item, seen)
-    elif isinstance(value, SharedArray) or (kind.__module__.startswith(_PACKAGES) and hasattr(value, "__dict__")):
-        for name in getattr(kind, "UPLOADED_LATER", ()):
-            getattr(value, name)
-        yield from _arrays_in(vars(value), seen)
+        return SimpleNamespace(arrays=[] if shape is None else list(arrays_in(vars(shape), {id(self)})))

@@ -146,8 +146,8 @@ class ExactShading:
         size = dr.maximum(*(dot(side, side) for side in sides))
         farthest = dr.minimum(dr.sqrt(size * dr.rcp(dot(ray_direction, ray_direction))), length) * dr.sqrt(dot(d, d))
         facing = dot(vector3(dr.detach(si.n)), ray_direction)
-        limits = {"max_distance": farthest, "facing": facing * self._sign}
-        location, kind, values = kernel.line_hits(hit, d, location, active, **limits)
+        limits = {"max_distance": farthest, "wanted_sign": facing * self._sign}
+        location, kind, known = kernel.line_hits(hit, d, location, active, **limits)
         self._count(kind, active)
         to_world = AffineMap.of(self.to_world) if moves and dr.grad_enabled(self.to_world) else self._map
         lines = None
@@ -155,7 +155,7 @@ class ExactShading:
             o, ray_direction = to_world.inverse_point(vector3(ray.o)), to_world.inverse_direction(vector3(ray.d))
             lines = Lines(o, ray_direction, kind == ON_LINE)
         order = 2 if flags & _NORMAL_DERIVATIVES else 1
-        points = kernel.at(location, active, order, constraint=lines, moves=moves, values=values)
+        points = kernel.at(location, active, order, constraint=lines, moves=moves, known=known)
         is_before = active & (dot(dr.detach(points.p) - hit, d) < 0)
         points = points.placed(to_world)
         if flags & _PARAMETERS:
