@@ -26,6 +26,9 @@ CASES = {
     "refined once": lambda: LimitSurface(bumpy(mixed_torus(), size=0.05)),
 }
 
+# Threads add in no fixed order.
+ORDER_OF_SUMS = 1e-5
+
 
 @pytest.fixture(params=CASES)
 def surface(request, monkeypatch):
@@ -48,6 +51,23 @@ def test_equals_sampling_table(surface, rate, float_type, rounding):
     np.testing.assert_allclose(p, expected[0], atol=rounding)
     # Normals lose the digits that cancel in the cross product of two nearly parallel tangents.
     np.testing.assert_allclose(vectors(normals), expected[1], atol=50 * rounding)
+
+
+def test_gradients_recorded_in_one_thread_run_in_many(surface, float_type, np_rng):
+    """Earlier, the second run wrote beyond its array."""
+    table, threads = surface.sampling(5), dr.thread_count()
+    kernel, points = VertexKernel(table, float_type), upload(float_type, surface.cage.positions)
+    change = np_rng.standard_normal((2, 3 * table.vertex_count))
+    # Of the gradients by points and by normals
+    arguments = points, *(upload(float_type, part) for part in change)
+    try:
+        dr.set_thread_count(1)
+        expected = np.array(kernel.gradient(*arguments))
+        dr.set_thread_count(max(threads, 2))
+        gradients = [np.array(kernel.gradient(*arguments)) for _ in range(20)]
+    finally:
+        dr.set_thread_count(threads)
+    np.testing.assert_allclose(gradients, [expected] * 20, atol=ORDER_OF_SUMS * np.abs(expected).max())
 
 
 def test_normals_depend_on_neither_the_origin_nor_the_scale(surface, float_type, rounding):

@@ -24,6 +24,7 @@ from ..mesh.shared import Content, Shared
 from ..patches.piece_table import PACKET, PieceTable, piece_packets
 from .array_types import (
     NO_CONFLICTS,
+    SUMS,
     ArrayTypes,
     FloatBuffer,
     Index,
@@ -207,7 +208,9 @@ class WeightBlocks:
             total = vectors[0] * 0
             for vector, weight in zip(vectors, self._row(row + k), strict=True):
                 total = dr.fma(vector, weight, total)
-            dr.scatter_add(sums, types.vector4(total.x, total.y, total.z, 0), control(k))
+            index = PACKET * control(k)
+            for axis, number in enumerate(total):
+                dr.scatter_add(sums, number, index + axis, mode=SUMS)
             return (k + 1,)
 
         start: tuple[Index] = (dr.zeros(types.index, self.count),)

@@ -13,7 +13,18 @@ from ..mesh import ragged
 from ..patches.piece_table import PACKET
 from ..tessellation.vertex_table import VertexPolynomials, VertexTable
 from .algebra import AffineMap, Monomials, unit
-from .array_types import NO_CONFLICTS, ArrayTypes, Float, FloatBuffer, Index, IndexBuffer, Matrix4, Vector3, replayed
+from .array_types import (
+    NO_CONFLICTS,
+    SUMS,
+    ArrayTypes,
+    Float,
+    FloatBuffer,
+    Index,
+    IndexBuffer,
+    Matrix4,
+    Vector3,
+    replayed,
+)
 from .linear_maps import SparseMatrix, WeightBlocks, attached
 
 # Least divisor when `UnitNormal` divides a tangent by its longest component, so that the cross product neither under-
@@ -85,7 +96,7 @@ class VertexKernel:
         if self._weld_target is not None:
             welded: Vector3 = dr.unravel(self._types.vector3, positions)
             positions = dr.zeros(self._types.float, 3 * self.vertex_count)
-            dr.scatter_add(positions, welded, self._weld_target)
+            dr.scatter_add(positions, welded, self._weld_target, mode=SUMS)
         dr.eval(positions, normals)
         padded = self._padded(control_points)
         sums: FloatBuffer = dr.zeros(self._types.float, PACKET * self._refined_count)
