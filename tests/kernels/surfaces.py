@@ -85,9 +85,9 @@ def surface_named(name):
 
 
 @lru_cache
-def kernel_named(name, variant, evaluator="stabilized"):
+def kernel_named(name, variant):
     """Its kernel, for tests that leave the control points as they are."""
-    return surface_named(name).on_device(variant, evaluator)
+    return surface_named(name).on_device(variant)
 
 
 def grid_locations(surface, segments):

@@ -45,8 +45,6 @@ BARS = {
 BORDER_NORMAL = 2e-6
 # Of the cage's size: what single precision cannot tell apart in coordinates of this size.
 ONE_POINT = 2.0**-24
-# Stam's first term in double precision: what rounding leaves of a sum that should be zero, times 2^5 for level 5.
-FIRST_TERM = 1e-11
 # Central differences in double precision: truncation of about the step squared, rounding over the step.
 STEP = 1e-6
 DIFFERENCES = 1e-7
@@ -183,27 +181,6 @@ def test_a_scheme_of_a_user_is_evaluated(np_rng):
     assert_same(samples, known.evaluate(*locations), BARS[DOUBLE])
 
 
-# Stam's form
-
-
-def test_stams_form_is_the_same_but_for_rounding_which_takes_its_normals_in_single_precision(np_rng):
-    surface = surface_named("valence 3")
-    locations = random_locations(surface, np_rng, 500, deepest=5)
-    expected = surface.evaluate(*locations)
-    for variant, bar in ((DOUBLE, FIRST_TERM), (SINGLE, 1e-4)):
-        samples = evaluated(kernel_named("valence 3", variant, "stam"), *locations)
-        np.testing.assert_allclose(vectors(samples.n), expected.n, rtol=0, atol=bar)
-
-    uv = np.ldexp(np.random.default_rng(1).random((200, 2)) / 2 + 0.25, -18).astype(np.float32).astype(float)
-    element = np.zeros(200, dtype=int)
-    expected, lost = surface.evaluate(element, uv), {}
-    for evaluator in ("stam", "stabilized"):
-        samples = evaluated(kernel_named("valence 3", SINGLE, evaluator), element, uv, 0 * element)
-        lost[evaluator] = np.linalg.norm(vectors(samples.n) - expected.n, axis=1)
-    assert np.median(lost["stam"]) > 1e-3
-    assert lost["stabilized"].max() < 1e-6
-
-
 # Derivatives
 
 # Of few control points each, as the kernels for derivatives by these take long to compile.
@@ -323,7 +300,7 @@ def test_control_points_and_places_have_any_natural_form_but_no_other_number():
 ARRAYS_ONLY = "expected one of Mitsuba's for arrays, which begin with llvm or cuda"
 
 
-def test_surfaces_have_the_precision_of_their_variant_and_unknown_ones_and_evaluators_are_errors():
+def test_surfaces_have_the_precision_of_their_variant_and_unknown_ones_are_errors():
     for cage in (torus(5, 4), extraordinary(5)):
         surface = LimitSurface(cage)
         assert surface.on_device(SINGLE).types.float is dr.llvm.ad.Float
@@ -332,7 +309,6 @@ def test_surfaces_have_the_precision_of_their_variant_and_unknown_ones_and_evalu
     for arguments, message in (
         (["opencl_rgb"], f'variant "opencl_rgb"; {ARRAYS_ONLY}'),
         (["scalar_rgb"], f'variant "scalar_rgb"; {ARRAYS_ONLY}'),
-        ([SINGLE, "power"], 'evaluator "power"; expected "stabilized" or "stam" on a device'),
     ):
         with pytest.raises(ValueError, match=message):
             surface.on_device(*arguments)

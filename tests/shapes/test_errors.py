@@ -80,6 +80,7 @@ FOUR_TEXCOORDS = {"texcoords": np.zeros((4, 2))}
         ({"displacement_scale": 0.5}, '"displacement_scale" needs "displacement"'),
         ({**OF_HEIGHTS, "displacement_scale": "high"}, "\"displacement_scale\" is 'high'; expected a number"),
         ({**OF_HEIGHTS, **STAM}, '"displacement" and "evaluator" contradict each other'),
+        ({"shading": "exact", **STAM}, '"shading" and "evaluator" contradict each other'),
         ({**OF_HEIGHTS, "sample_offset": 0.1}, '"displacement" and "sample_offset" contradict each other'),
         # Adaptive triangles
         (ADAPTIVE, "no limit; expected exactly one of chord_error, pixel_error, max_edge"),

@@ -372,18 +372,3 @@ def test_merged_shapes_are_met_as_others():
     assert seen.sum() > RESOLUTION
     for value, other in ((si.sh_frame.n, expected.sh_frame.n), (si.uv, expected.uv), (si.dp_du, expected.dp_du)):
         np.testing.assert_allclose(rows(value)[seen], rows(other)[seen], atol=NORMAL)
-
-
-@pytest.mark.usefixtures("no_other_scene")
-def test_stams_form_goes_wrong_as_it_is_published(np_rng):
-    cage, distance = named_cages.extraordinary(5), 1e-3
-    surface, uv = LimitSurface(cage), distance * np_rng.uniform(0.5, 1, (400, 2))
-    at = surface.evaluate(0, uv)
-    published = np.linalg.norm(surface.evaluate(0, uv, evaluator="stam", dtype=np.float32).n - at.n, axis=1)
-    stabilized, stam = (
-        np.linalg.norm(rows(hits(make(cage, **options), rays(at.p + 0.1 * at.n, -at.n)).sh_frame.n) - at.n, axis=1)
-        for options in ({}, {"evaluator": "stam", "sample_offset": distance})
-    )
-    assert stabilized.max() < NORMAL
-    assert 0.3 < np.median(stam) / np.median(published) < 3
-    assert np.median(stam) > 3 * np.median(stabilized)

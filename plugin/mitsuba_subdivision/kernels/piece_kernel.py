@@ -10,7 +10,6 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from operator import add
 from typing import Any, NamedTuple
 
 import drjit as dr
@@ -228,11 +227,6 @@ class Piece:
         value, *partials = (
             added(vector, change) for vector, change in zip((value, *partials), (point, *derivative_sums), strict=False)
         )
-        if kernel.basis_functions is not None:
-            errors = (dr.select(is_deep, error, 0) for error in kernel.first_term(s, t))
-            value, *partials[:2] = (
-                added(vector, point, error) for vector, error in zip((value, *partials[:2]), errors, strict=True)
-            )
         if not has_frame:
             return value, partials, None
         by_s, by_t, tangent_s, tangent_t = *partials[:2], *derivative_sums[-2:]
@@ -252,18 +246,12 @@ class PieceKernel:
         self,
         table: PieceTable,
         float_type: type,  # Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``
-        # Whether tips are evaluated by (9) and (11) instead of (10) and (12). Their levels must have no pieces.
-        use_stam: bool = False,
     ) -> None:
-        if use_stam and table.piece_levels:
-            raise ValueError("a table with levels of tips that are pieces; expected one made for Stam's form")
         self.types = types = ArrayTypes(float_type)
         scheme = table.patches.scheme
         self.domain, basis = scheme.domain, polynomial_basis(scheme)
         self.monomials = Monomials(basis.powers.tolist())
         self.centre = tuple(scheme.domain.centre.tolist())  # The middle of the domain
-        # Coefficients of each function of the scheme's basis, for Stam's form
-        self.basis_functions = basis.matrix.T.tolist() if use_stam else None
         self.walk = ElementWalk(table, types)  # Over the table's elements
         self.count = len(basis.powers)
         self._row_size = -(-self.count // PACKET) * PACKET
@@ -353,19 +341,6 @@ class PieceKernel:
     def factor(self, index: Index, active: Mask = True) -> Float:
         """Fetch the factor of a term."""
         return dr.gather(self.types.float, self._weights, index, active)
-
-    def first_term(self, s: Float, t: Float) -> list[Float]:
-        """Rounding errors of the first terms of (9) and (11), which (10) and (12) avoid.
-
-        They are those of the sums of the basis functions and of their derivatives. Returns the factors of the point
-        ``ĉ_1`` in the errors of the point and of its derivatives by s and t.
-        """
-        functions = (
-            self.monomials.values([s * 0 + x for x in coefficients], s, t)
-            for coefficients in self.basis_functions or []
-        )
-        value, by_s, by_t = (reduce(add, terms, s * 0) for terms in zip(*functions, strict=True))
-        return [value - 1, by_s, by_t]
 
     def _split(
         self, half_edge: Index, row: Index4, u: Float, v: Float, active: Mask

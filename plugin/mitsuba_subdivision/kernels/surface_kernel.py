@@ -84,13 +84,11 @@ class SurfaceKernel:
         table: PieceTable,
         float_type: type,  # Flat Dr.Jit array, such as ``drjit.llvm.ad.Float``
         *,
-        # Whether to evaluate by Stam's form, (9) and (11), with the first term that the stabilised form omits
-        use_stam: bool = False,
         cells: Callable[[], SamplingCells] | None = None,  # Makes the cells for `sample` when it is first called
     ) -> None:
         self.types = ArrayTypes(float_type)
         self._make_cells = cells
-        self._patches = shared(PieceKernel, table, float_type, use_stam)
+        self._patches = shared(PieceKernel, table, float_type)
         self.walk = self._patches.walk  # Over the surface's elements
         # Displacement of the surface. All results are those of the displaced surface, and differentiable with respect
         # to the heights and their scale.

@@ -61,11 +61,11 @@ class ExactShading:
         # (n, 3) float64: control points of the surface, relative to the centre of `Placement`
         positions: NDArray[np.float64],
     ) -> None:
-        surface, evaluator = parameters.surface, parameters.evaluator
+        surface = parameters.surface
         self._variant = variant
         self._name = surface.cage.source.name
         # The surface in object space, relative to the centre
-        self.kernel = SurfaceKernel(surface.pieces(evaluator), variant.Float, use_stam=evaluator == "stam")
+        self.kernel = SurfaceKernel(surface.pieces(), variant.Float)
         self.kernel.values.load(positions)
         self.to_world: Matrix4 = self.kernel.types.matrix4(1)  # For points relative to the centre
         self._counts: IndexBuffer = dr.zeros(self.kernel.types.index, len(_KINDS))

@@ -61,7 +61,7 @@ class MeshBuffers:
         evaluates = shading or displacement
         self._surface: SurfaceKernel | None = None if evaluates is None else evaluates.kernel
         self._types = ArrayTypes(variant.Float) if dr.is_jit_v(variant.Float) else None
-        self._is_sampled = parameters.evaluator != "stabilized" or parameters.sample_offset > 0
+        self._is_sampled = parameters.is_sampled
         # Whether vertices are differentiable with respect to control points, placement and displacement.
         self.are_differentiable = not self._is_sampled and dr.is_diff_v(variant.Float)
         if self.are_differentiable:

@@ -123,15 +123,16 @@ film_height : int
 shading : string = vertex | exact | auto
     ``vertex``: exact normals at the triangles' vertices, interpolated between them. ``exact``: position, normal,
     tangents, their derivatives, texture coordinates and attributes of the limit surface at every hit. ``auto``:
-    ``exact`` in JIT variants where it works and without ``face_normals``, else ``vertex``.
+    ``exact`` in JIT variants where it works and without ``face_normals``, ``evaluator`` and ``sample_offset``, else
+    ``vertex``.
 displacement : texture or string
     Heights that displace the surface along its normals: a scalar texture over the texture coordinates, or the mesh
     attribute ``vertex_NAME`` of a cage's attribute with one number per value. (Default: none)
 displacement_scale : float = 1; exposed, differentiable, discontinuous
     Factor of the heights.
 evaluator : string = stabilized | stam
-    ``stabilized``, or ``stam``: points and normals by Stam's form in single precision, which fails at extraordinary
-    vertices; for comparison.
+    ``stabilized``, or ``stam``: points and normals of vertices by Stam's form in single precision, which fails at
+    extraordinary vertices; for comparison, with vertex shading.
 sample_offset : float = 0
     Sample extraordinary vertices at u = v = this value instead of at the vertex itself, where Stam's form has no value;
     below 1.

@@ -117,6 +117,11 @@ class Parameters:
     displacement_scale: float
     shown: NDArray[np.bool_] | None  # (n_f,) bool: elements whose triangles are kept; None for all
 
+    @property
+    def is_sampled(self) -> bool:
+        """Whether vertices are samples by another evaluator, or beside extraordinary vertices, for comparison."""
+        return self.evaluator != "stabilized" or self.sample_offset > 0
+
 
 def read_parameters(props: mi.Properties) -> Parameters:
     """Read and check the parameters of the shape in a scene.
@@ -142,12 +147,18 @@ def read_parameters(props: mi.Properties) -> Parameters:
             'parameters "face_normals" and "shading" contradict each other; expected flat or exact shading'
         )
     displacement, scale = _displacement(props)
-    if displacement is not None and (evaluator != "stabilized" or offset):
+    if evaluator != "stabilized" or offset:
         other = "evaluator" if evaluator != "stabilized" else "sample_offset"
-        raise ValueError(
-            f'parameters "displacement" and "{other}" contradict each other; expected only one of them, as other '
-            "forms than the stabilised one have no derivatives that are good enough"
-        )
+        if displacement is not None:
+            raise ValueError(
+                f'parameters "displacement" and "{other}" contradict each other; expected only one of them, as other '
+                "forms than the stabilised one have no derivatives that are good enough"
+            )
+        if shading == "exact":
+            raise ValueError(
+                f'parameters "shading" and "{other}" contradict each other; expected vertex shading, as other forms '
+                "than the stabilised one are evaluated at vertices only"
+            )
 
     cage = _cage(props, None if scheme is None else scheme.name)
     to_world = checked_matrix(props["to_world"]) if "to_world" in props else np.eye(4)

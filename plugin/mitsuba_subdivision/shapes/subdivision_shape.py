@@ -409,7 +409,7 @@ def _has_textured_emitter(props: mi.Properties, variant: Variant) -> bool:
 
 
 def _is_exact(parameters: Parameters, variant: Variant) -> bool:
-    if parameters.shading == "auto" and not parameters.face_normals:
+    if parameters.shading == "auto" and not (parameters.face_normals or parameters.is_sampled):
         from .interaction_hook import exact_shading_problem
 
         return exact_shading_problem(variant) is None

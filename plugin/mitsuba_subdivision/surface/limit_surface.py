@@ -428,15 +428,10 @@ class LimitSurface:
         element = self.patches.elements.face[half_edge].astype(np.int64)
         return element, half_edge - self.patches.elements.face_offsets[element]
 
-    def pieces(self, evaluator: Evaluator = "stabilized") -> PieceTable:
+    def pieces(self) -> PieceTable:
         """Prepare evaluation anywhere on a device: all data that does not depend on the control points' positions.
 
         Surfaces of the same topology, tags and rules share the object while a surface that called this method exists.
-
-        Parameters
-        ----------
-        evaluator : "stabilized" | "stam"
-            For Stam's form, levels around extraordinary points are not stored as polynomial pieces.
 
         Raises
         ------
@@ -445,18 +440,13 @@ class LimitSurface:
         MemoryError
             If the pieces of so many classes of patches do not fit into memory.
         """
-        if evaluator not in self._pieces:
-            levels = {"piece_levels": 0} if evaluator == "stam" else {}
-            self._pieces[evaluator] = PieceTable.build(
-                self.patches, self.cage.cut_mesh.vertex, self.cage.vertex_count, **levels
-            )
-        return self._pieces[evaluator]
+        return self._pieces
 
     @cached_property
-    def _pieces(self) -> dict[Evaluator, PieceTable]:
-        return {}
+    def _pieces(self) -> PieceTable:
+        return PieceTable.build(self.patches, self.cage.cut_mesh.vertex, self.cage.vertex_count)
 
-    def on_device(self, variant: ModuleType | str, evaluator: Evaluator = "stabilized") -> SurfaceKernel:
+    def on_device(self, variant: ModuleType | str) -> SurfaceKernel:
         """The surface on a device: evaluated at any parameters, and intersected by rays, in the variant's precision.
 
         Points that single precision cannot tell from an extraordinary vertex have its normal, in every variant.
@@ -466,7 +456,6 @@ class LimitSurface:
         variant : module or str
             ``mitsuba`` with a variant set, a variant such as ``mitsuba.llvm_ad_rgb``, or its name, "llvm_ad_rgb". It
             determines backend, precision and derivatives.
-        evaluator : "stabilized" or "stam"
 
         Returns
         -------
@@ -476,18 +465,15 @@ class LimitSurface:
         Raises
         ------
         ValueError
-            If the variant is unknown or scalar, or none is set, or the evaluator is another one.
+            If the variant is unknown or scalar, or none is set.
         SchemeError
             As `pieces`.
         """
         from ..kernels.array_types import float_type_of
         from ..kernels.surface_kernel import SurfaceKernel
 
-        if evaluator not in ("stabilized", "stam"):
-            raise ValueError(f'evaluator "{evaluator}"; expected "stabilized" or "stam" on a device')
         float_type = float_type_of(variant_name(variant))
-        cells = self._sampling_cells
-        kernel = SurfaceKernel(self.pieces(evaluator), float_type, use_stam=evaluator == "stam", cells=cells)
+        kernel = SurfaceKernel(self.pieces(), float_type, cells=self._sampling_cells)
         kernel.set_control_points(self.cage.positions)
         return kernel
 
