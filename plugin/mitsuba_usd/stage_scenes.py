@@ -322,8 +322,8 @@ def usd_scene(
 
     Meshes become limit surfaces, or polygons where they are not to be subdivided; with their transforms, instances,
     materials, lights and the camera. Where the stage has no lights or no camera, it gets those of the studio. Lengths
-    are those of the stage: below 0.01 units, Mitsuba's shadows leak, which `render` avoids by a larger scene. Under many
-    lights, `mitsuba_subdivision.weigh_lights` of the loaded scene samples each by what it adds to the picture.
+    are those of the stage: below 0.01 units, Mitsuba's shadows leak, which `render` avoids by a larger scene. With many
+    lights, `mitsuba_subdivision.weigh_lights` makes the loaded scene sample each by what it adds to the picture.
 
     Parameters
     ----------

@@ -29,11 +29,11 @@ from .parameter_table import errors_about
 
 if TYPE_CHECKING:
     from ..cage import ControlCage
+    from ..kernels.channel_kernel import ChannelKernel
     from ..patches.channel import Channel, ChannelLayout
     from ..surface import LimitSurface
     from ..tessellation.attribute_table import AttributeTable
     from .displacement import ShapeDisplacement
-    from .exact_shading import ExactShading
 
 PREFIX = "cage_"
 # Names of attributes whose buffers would be those of every Mitsuba mesh.
@@ -64,9 +64,12 @@ class CageAttributes:
         variant: Variant,
         surface: LimitSurface,
         names: Iterable[str],  # Names of the attributes that `traverse` exposes
-        # The parts of the shape that take new values of attributes
-        exact: ExactShading | None,
+        # What takes new values of attributes
+        channels: dict[str, ChannelKernel],  # Attributes that are evaluated at hits
         displacement: ShapeDisplacement | None,
+        # Of `retessellate`
+        attributes: AttributeTable,
+        names_at_vertices: Container[str],
         # Method that is called with an attribute's name and the gradient by its values, by the same name, after reverse
         # mode has reached these
         on_backward: WeakMethod,
@@ -84,7 +87,6 @@ class CageAttributes:
             f"{PREFIX}{name}": self._kind(given.array) for name, given in self._given.items()
         }
         # Functions that take new values of attributes, flat, and names of the parameters that move vertices
-        channels = {} if exact is None else exact.channels
         self._followers = {name: channel.values.set for name, channel in channels.items()}
         self.moving: set[str] = set()
         if displacement is not None:
@@ -99,6 +101,7 @@ class CageAttributes:
             name: BackwardPasses(self._source, f"{PREFIX}{name}", variant.Float)
             for name in (self._channels if dr.is_diff_v(variant.Float) else ())
         }
+        self.retessellate(attributes, names_at_vertices)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose the parameters."""
@@ -107,8 +110,8 @@ class CageAttributes:
             discontinuity = flags.Discontinuous if name in self.moving else flags.Differentiable
             callback.put(name, values, flags.Differentiable | discontinuity)
 
-    def set_triangles(self, attributes: AttributeTable, names: Container[str]) -> None:
-        """Set the tessellation, whose vertices have the attributes that are among ``names``."""
+    def retessellate(self, attributes: AttributeTable, names: Container[str]) -> None:
+        """Choose the vertices, which have the attributes that are among ``names``."""
         self._uploaded = {
             name: shared(_uploaded, self._kind, Content(attributes.values[name].astype(np.float32)))
             for name in self._channels

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 
     from ..patches.channel import Channel
     from ..tessellation.attribute_table import AttributeLayout
-    from .exact_shading import ExactShading
     from .parameters import Parameters
 
 # Step of central differences of a texture, in texture coordinates.
@@ -58,11 +57,7 @@ _LUMINANCE = (0.212671, 0.715160, 0.072169)
 
 
 class ShapeDisplacement:
-    """Displacement of a shape's surface and of its vertices: heights, their channel, and the scale.
-
-    Copies of a vertex along creases and seams are displaced by the mean of their displacements, so that they stay
-    bitwise equal. Each copy has the normal of its side. In JIT variants, differentiable with respect to control points,
-    the scale, and the texture or control values of the heights.
+    """Displacement of a shape's surface: heights, the channel that they depend on, and their scale.
 
     Raises ValueError if the cage lacks the channel that heights depend on, or heights are not scalar.
     """
@@ -71,59 +66,28 @@ class ShapeDisplacement:
         self,
         variant: Variant,
         parameters: Parameters,
-        positions: FloatArray,  # (n, 3) float64: control points, relative to the centre of `Placement`
-        exact: ExactShading | None,  # Exact shading of the shape, whose surface is displaced, too
+        kernel: SurfaceKernel | None,  # The surface on the device, which is displaced, too; None in scalar variants
+        channels: dict[str, ChannelKernel],  # Attributes that are evaluated at hits
     ) -> None:
-        self._surface, given, scale = parameters.surface, parameters.displacement, parameters.displacement_scale
-        self._has_normals = exact is None and not parameters.face_normals
+        surface, given, scale = parameters.surface, parameters.displacement, parameters.displacement_scale
         # Name of the channel that the heights depend on: an attribute, or "texcoords".
-        self.attribute = _attribute_named(given, self._surface) if isinstance(given, str) else TEXCOORDS
-        if self.attribute not in self._surface.attribute_names:
+        self.attribute = _attribute_named(given, surface) if isinstance(given, str) else TEXCOORDS
+        if self.attribute not in surface.attribute_names:
             raise ValueError(
-                f"a texture was given, and {self._surface.cage.source.name} has no texture coordinates; expected a "
-                "cage with some, or the name of an attribute"
+                f"a texture was given, and {surface.cage.source.name} has no texture coordinates; expected a cage with "
+                "some, or the name of an attribute"
             )
         self.heights = Heights() if isinstance(given, str) else TextureHeights(variant, given)
         # The channel with its current values on the host; after an update, these are read when they are needed.
-        self._channel, self._updated = self._surface.channel(self.attribute), None
+        self._channel, self._updated = surface.channel(self.attribute), None
         # The parameter ``displacement_scale``: a flat array of one number.
         self.scale = flat_type(variant)([scale])
-        # The displaced surface on the device, shared with exact shading; None in scalar variants.
-        self.kernel: SurfaceKernel | None = None
-        if exact is not None:
-            self.kernel = exact.kernel
-        elif dr.is_jit_v(variant.Float):
-            self.kernel = SurfaceKernel(self._surface.pieces(), variant.Float)
-            self.kernel.values.load(positions)
-        if self.kernel is not None:
-            channel = ChannelKernel(self._channel, variant.Float) if exact is None else exact.channels[self.attribute]
-            self.kernel.displacement = Displacement(channel, self.heights, scale)
+        self.kernel = kernel
+        if kernel is not None:
+            channel = channels.get(self.attribute) or ChannelKernel(self._channel, variant.Float)
+            kernel.displacement = Displacement(channel, self.heights, scale)
         self.require_scale()
         self.take_scale()
-
-    def set_triangles(
-        self,
-        layout: AttributeLayout,  # Vertices with copies along all seams, whose different displacements are averaged
-        weld_target: NDArray[np.uint32] | None,  # Their `split_weld_targets`
-    ) -> None:
-        """Set the vertices of the shape."""
-        # (n,) int64: corner of an element from which parameters are seen, a half-edge of `PatchTable.elements`; and
-        # (n, 2) float64: parameters. Samples at corners of elements have (0, 0).
-        self._corner, self._uv = corner, uv = layout.locate()
-        self._mean: Any = None if weld_target is None else _mean_over_copies(weld_target)
-        # (n,) bool: whether the slope of heights along the surface exists. It does not exist at an extraordinary point
-        # where a seam ends, as positions and values contract at different rates.
-        self._has_slope: Any = np.ones(len(corner), dtype=bool)
-        corners = np.flatnonzero((uv == 0).all(axis=1))
-        samples = self._sampler(self._surface.cage.positions).evaluate(corner[corners], uv[corners])
-        points = corners[samples.level == AT_EXTRAORDINARY_POINT]
-        self._has_slope[points] = contracts_alike(self.channel, self._surface.patches, corner[points])
-        if self.kernel is not None:
-            types = self.kernel.types
-            self._location = Location(types.indices(corner), *map(types.floats, uv.T))
-            self._has_slope = types.indices(self._has_slope.astype(np.uint32)) != 0
-            dr.eval(self._has_slope)
-            self._mean = self._mean if self._mean is None else SparseMatrix(self._mean, types.float)
 
     def require_scale(self) -> None:
         """Raise ValueError if ``displacement_scale`` is not a finite number, unless it cannot be read."""
@@ -138,14 +102,15 @@ class ShapeDisplacement:
         if dr.is_jit_v(self.scale):
             # Dr.Jit compiles literals into kernels.
             dr.make_opaque(self.scale)
-        # A copy, because users assign the parameter in place before it is checked.
-        self._scale = type(self.scale)(self.scale)
+        # The scale that is applied: a copy, because users assign the parameter in place before it is checked.
+        self.factor = type(self.scale)(self.scale)
         if self.kernel is not None and self.kernel.displacement is not None:
-            self.kernel.displacement.scale = self._scale
+            self.kernel.displacement.scale = self.factor
 
     @property
-    def _host_scale(self) -> float:
-        return float(np.array(dr.detach(self._scale)).item())
+    def host_scale(self) -> float:
+        """The applied scale."""
+        return float(np.array(dr.detach(self.factor)).item())
 
     @property
     def channel(self) -> Channel:
@@ -173,7 +138,7 @@ class ShapeDisplacement:
     def bound(self, to_world: FloatArray) -> DisplacementBound:
         """Scaled heights in world space as a function of the location, and their bound, for adaptive tessellation."""
         # The spectral norm is the largest factor by which the linear map scales a length.
-        channel, scale = self.channel, self._host_scale * float(np.linalg.norm(to_world[:3, :3], 2))
+        channel, scale = self.channel, self.host_scale * float(np.linalg.norm(to_world[:3, :3], 2))
         float_type = dr.scalar.ArrayXf64 if self.kernel is None else self.kernel.types.float
 
         def heights_at(start: IntArray, uv: FloatArray) -> FloatArray:
@@ -184,18 +149,55 @@ class ShapeDisplacement:
 
         return DisplacementBound(heights_at, max(map(abs, self.heights.range(channel))) * abs(scale))
 
-    def displaced(
+
+class DisplacedVertices:
+    """Displacement of the vertices of a mesh.
+
+    Copies of a vertex along creases and seams are displaced by the mean of their displacements, so that they stay
+    bitwise equal. Each copy has the normal of its side. In JIT variants, differentiable with respect to control points,
+    the scale, and the texture or control values of the heights.
+    """
+
+    def __init__(
+        self,
+        displacement: ShapeDisplacement,
+        parameters: Parameters,
+        layout: AttributeLayout,  # Vertices with copies along all seams, whose different displacements are averaged
+        weld_target: NDArray[np.uint32] | None,  # Their `split_weld_targets`
+        *,
+        has_normals: bool,  # Whether the mesh has normals at its vertices
+    ) -> None:
+        self._displacement, self._surface, self._has_normals = displacement, parameters.surface, has_normals
+        # (n,) int64: corner of an element from which parameters are seen, a half-edge of `PatchTable.elements`; and
+        # (n, 2) float64: parameters. Samples at corners of elements have (0, 0).
+        self._corner, self._uv = corner, uv = layout.locate()
+        self._mean: Any = None if weld_target is None else _mean_over_copies(weld_target)
+        # (n,) bool: whether the slope of heights along the surface exists. It does not exist at an extraordinary point
+        # where a seam ends, as positions and values contract at different rates.
+        self._has_slope: Any = np.ones(len(corner), dtype=bool)
+        corners = np.flatnonzero((uv == 0).all(axis=1))
+        samples = self._sampler(self._surface.cage.positions).evaluate(corner[corners], uv[corners])
+        points = corners[samples.level == AT_EXTRAORDINARY_POINT]
+        self._has_slope[points] = contracts_alike(displacement.channel, self._surface.patches, corner[points])
+        if displacement.kernel is not None:
+            types = displacement.kernel.types
+            self._location = Location(types.indices(corner), *map(types.floats, uv.T))
+            self._has_slope = types.indices(self._has_slope.astype(np.uint32)) != 0
+            dr.eval(self._has_slope)
+            self._mean = self._mean if self._mean is None else SparseMatrix(self._mean, types.float)
+
+    def __call__(
         self,
         positions: FloatBuffer,
         normals: FloatBuffer,
         points: FloatBuffer,  # Control points of the surface
     ) -> tuple[FloatBuffer, FloatBuffer]:
         """Displace flat positions and normals of the vertices."""
-        kernel: Any = self.kernel
+        given, kernel = self._displacement, cast("Any", self._displacement.kernel)
         if kernel is None:
-            return self._displaced_on_host(np.reshape(positions, (-1, 3)), np.reshape(normals, (-1, 3)), points)
+            return self._on_host(np.reshape(positions, (-1, 3)), np.reshape(normals, (-1, 3)), points)
         n, (value, _, _) = dr.unravel(kernel.types.vector3, normals), kernel.displacement.channel(self._location)
-        steps = dr.ravel(self.heights.height(value) * self._scale * n)
+        steps = dr.ravel(given.heights.height(value) * given.factor * n)
         positions = positions + (steps if self._mean is None else self._mean(steps, 3))
         if self._has_normals:
             displaced_normal = kernel.at(self._location).n
@@ -203,15 +205,14 @@ class ShapeDisplacement:
             normals = dr.ravel(dr.select(exists, displaced_normal, n))
         return positions, normals
 
-    def _displaced_on_host(
-        self, positions: NDArray, normals: NDArray, points: FloatBuffer
-    ) -> tuple[FloatBuffer, FloatBuffer]:
-        rows_of_channel = self.channel.with_derivatives(self._corner, self._uv)
+    def _on_host(self, positions: NDArray, normals: NDArray, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
+        given, scale = self._displacement, self._displacement.host_scale
+        rows_of_channel = given.channel.with_derivatives(self._corner, self._uv)
         value, du, dv = (_columns(rows) if rows.shape[1] > 1 else _columns(rows)[0] for rows in rows_of_channel)
-        steps = np.array(self.heights.height(value))[:, None] * self._host_scale * normals
+        steps = np.array(given.heights.height(value))[:, None] * scale * normals
         positions = positions + (steps if self._mean is None else self._mean @ steps).astype(np.float32)
         if self._has_normals:
-            h, h_u, h_v = (self._host_scale * component for component in self.heights(value, du, dv))
+            h, h_u, h_v = (scale * component for component in given.heights(value, du, dv))
             # Second derivatives do not exist at extraordinary points.
             sampler = self._sampler(np.array(points, dtype=np.float64).reshape(-1, 3))
             samples = sampler.evaluate(self._corner, self._uv, derivatives=2)

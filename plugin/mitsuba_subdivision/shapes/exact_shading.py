@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from numpy.typing import NDArray
 
 from ..kernels.algebra import AffineMap, added, dot, over
-from ..kernels.array_types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Value, Vector2, Vector3
+from ..kernels.array_types import Float, Index, IndexBuffer, Mask, Matrix4, Value, Vector2, Vector3
 from ..kernels.channel_kernel import ChannelKernel
 from ..kernels.line_intersection import ON_LINE, Lines
 from ..kernels.locations import Location, TriangleLocations
 from ..kernels.surface_kernel import SurfaceKernel, SurfacePoints
-from ..mesh.connectivity import IntArray
 from ..mesh.shared import shared
 from ..surface import TEXCOORDS
 from ..variants import Variant
@@ -26,13 +24,12 @@ from .outlines import turn_to_seen
 from .placement import Placement
 
 if TYPE_CHECKING:
-    from ..tessellation.vertex_table import VertexTable
-    from .interaction_hook import TriangleHit
-    from .parameters import Parameters
+    from ..surface import LimitSurface
+    from .mesh_buffers import Triangles
 
 # Length of the rays to points of outlines, in which projective integrators compute the radiance beside these.
 OUTLINE = 1
-# Cosine of the angle between a ray and the normals that `_facing` turns to a silhouette.
+# Cosine of the angle between a ray and the normals that `_turned_to_ray` turns to a silhouette.
 GRAZING = 1e-2
 # Tolerance when comparing texture coordinates, or parameters, of a location.
 SAME_PARAMETERS = 1e-3
@@ -46,6 +43,30 @@ _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 STEPS = 3
 
 
+class TriangleHit(NamedTuple):
+    """Arguments of `mi.Shape.compute_surface_interaction`."""
+
+    ray: mi.Ray3f
+    preliminary: mi.PreliminaryIntersection3f
+    flags: int  # `mi.RayFlags`
+    active: Mask
+
+
+def channels_at_hits(surface: LimitSurface, float_type: type) -> dict[str, ChannelKernel]:
+    """Texture coordinates and attributes that are evaluated at hits, by their names in the cage."""
+    channels = {name: surface.channel(name) for name in surface.attribute_names}
+    kernels = {
+        name: ChannelKernel(channel, float_type)
+        for name, channel in channels.items()
+        if name == TEXCOORDS or channel.values.shape[1] in WIDTHS
+    }
+    for layout in {channel.layout for channel in channels.values()}:
+        # Values with seams have a mesh of their own.
+        if layout.patches is not surface.patches:
+            layout.patches.forget()
+    return kernels
+
+
 class ExactShading:
     """Completes the surface interactions of a shape.
 
@@ -57,41 +78,31 @@ class ExactShading:
     def __init__(
         self,
         variant: Variant,
-        parameters: Parameters,
-        # (n, 3) float64: control points of the surface, relative to the centre of `Placement`
-        positions: NDArray[np.float64],
+        shape: mi.Mesh,  # Its current material is used at each hit; not kept alive
+        name: str,  # Of the cage, in messages
+        kernel: SurfaceKernel,  # The surface in object space, relative to the centre of the placement
+        channels: dict[str, ChannelKernel],  # See `channels_at_hits`
+        placement: Placement,
+        triangles: Triangles,
     ) -> None:
-        surface = parameters.surface
-        self._variant = variant
-        self._name = surface.cage.source.name
-        # The surface in object space, relative to the centre
-        self.kernel = SurfaceKernel(surface.pieces(), variant.Float)
-        self.kernel.values.load(positions)
-        self.to_world: Matrix4 = self.kernel.types.matrix4(1)  # For points relative to the centre
-        self._counts: IndexBuffer = dr.zeros(self.kernel.types.index, len(_KINDS))
-        # Texture coordinates and attributes that are evaluated at hits, by their names in the cage
-        channels = {name: surface.channel(name) for name in surface.attribute_names}
-        self.channels = {
-            name: ChannelKernel(channel, variant.Float)
-            for name, channel in channels.items()
-            if name == TEXCOORDS or channel.values.shape[1] in WIDTHS
-        }
-        for layout in {channel.layout for channel in channels.values()}:
-            # Values with seams have a mesh of their own.
-            if layout.patches is not surface.patches:
-                layout.patches.forget()
-        self._texcoords = self.channels.get(TEXCOORDS)
-        self._attributes = {mesh_name(name): channel for name, channel in self.channels.items() if name != TEXCOORDS}
+        self._variant, self._name, self.kernel, self.channels = variant, name, kernel, channels
+        self._shape: Callable[[], mi.Mesh | None] = weakref.ref(shape)
+        # Of normals, relative to those of the surface
+        self._sign = -1.0 if shape.has_flipped_normals() else 1.0
+        self._counts: IndexBuffer = dr.zeros(kernel.types.index, len(_KINDS))
+        self._texcoords = channels.get(TEXCOORDS)
+        self._attributes = {mesh_name(name): channel for name, channel in channels.items() if name != TEXCOORDS}
         sizes = {name: channel.values.size for name, channel in self._attributes.items()}
         self._upsampling = spectral_upsampling(variant, sizes)
-        self._shape: Callable[[], mi.Mesh | None] = lambda: None
-        self._sign = 1.0
+        self.to_world: Matrix4 = kernel.types.matrix4(1)  # For points relative to the centre
+        self.update(placement.matrix, placement)
+        self.retessellate(triangles)
 
-    def set_triangles(self, table: VertexTable, kept: IntArray | None = None) -> None:
-        """Set the triangles of the shape before the first hit: all of a table, or those with the indices ``kept``."""
+    def retessellate(self, triangles: Triangles) -> None:
+        """Choose the triangles of the shape, before their first hit."""
         # Shapes with the same tessellation and elements share locations.
-        self._triangles = shared(TriangleLocations, table, self.kernel.walk)
-        self._kept = None if kept is None else self.kernel.types.indices(kept)
+        self._triangles = shared(TriangleLocations, triangles.table, self.kernel.walk)
+        self._kept = None if triangles.kept is None else self.kernel.types.indices(triangles.kept)
 
     def _located(self, triangle: Index, b1: Float, b2: Float, active: Mask) -> Location:
         """The location of a point of a triangle of the shape, see `TriangleLocations`."""
@@ -99,20 +110,13 @@ class ExactShading:
             triangle = dr.gather(self.kernel.types.index, self._kept, triangle, active)
         return self._triangles(triangle, b1, b2, active)
 
-    def follow(self, shape: mi.Mesh) -> None:
-        """Use a shape's current material at each hit, and the orientation of its normals, without keeping it alive."""
-        self._shape = weakref.ref(shape)
-        self._sign = -1.0 if shape.has_flipped_normals() else 1.0
-
-    def set_transform(
+    def update(
         self,
-        to_world: Matrix4,  # Maps points relative to the centre to world space
-        coefficients: FloatBuffer,  # Coefficients of the kernel, possibly attached to control points
-        placement: Placement,  # Placement of ``to_world``
+        to_world: Matrix4,  # Maps points relative to the centre to world space, possibly attached to the parameter
+        placement: Placement,  # Of ``to_world``
     ) -> None:
-        """Set the transformation and the coefficients. Surface interactions are differentiable with respect to both."""
+        """Set the transformation. Surface interactions are differentiable with respect to it."""
         self._are_turned = placement.mirrors
-        self.kernel.values.take(coefficients)
         # Assign in place, because other objects may hold a reference to the array.
         self.to_world[:] = self.kernel.types.matrix4(to_world)
         self._map = AffineMap.of(dr.detach(self.to_world), self.kernel.types.matrix4(placement.inverse()))
@@ -134,9 +138,9 @@ class ExactShading:
             b1, b2 = b2, b1
         # Trace no derivatives that are not needed.
         moves = not flags & _DETACHES and self._is_moving()
-        hit = self._map.inverse_point(vector3(dr.detach(si.p)))
-        ray_direction = vector3(dr.detach(ray.d))
-        d = self._map.inverse_direction(ray_direction)
+        ray_o, ray_d = vector3(ray.o), vector3(ray.d)
+        # The hit on the triangle and the ray's direction, in object space
+        hit, d = self._map.inverse_point(vector3(dr.detach(si.p))), self._map.inverse_direction(dr.detach(ray_d))
         location = self._located(preliminary.prim_index, b1, b2, active)
         # Integrators begin the rays to outlines at a distance of `OUTLINE`, wherever the sensor is.
         length = dr.select(preliminary.t == OUTLINE, dr.inf, dr.detach(si.t))
@@ -144,23 +148,24 @@ class ExactShading:
         # surface. Both are lengths in world space along the ray, converted to object space.
         sides = vector3(dr.detach(si.dp_du)), vector3(dr.detach(si.dp_dv))
         size = dr.maximum(*(dot(side, side) for side in sides))
-        farthest = dr.minimum(dr.sqrt(size * dr.rcp(dot(ray_direction, ray_direction))), length) * dr.sqrt(dot(d, d))
-        facing = dot(vector3(dr.detach(si.n)), ray_direction)
-        limits = {"max_distance": farthest, "wanted_sign": facing * self._sign}
+        squared = dot(dr.detach(ray_d), dr.detach(ray_d))
+        farthest = dr.minimum(dr.sqrt(size * dr.rcp(squared)), length) * dr.sqrt(dot(d, d))
+        # Negative where the ray hits the triangle from outside
+        side = dot(vector3(dr.detach(si.n)), dr.detach(ray_d))
+        limits = {"max_distance": farthest, "wanted_sign": side * self._sign}
         location, kind, known = kernel.line_hits(hit, d, location, active, **limits)
         self._count(kind, active)
         to_world = AffineMap.of(self.to_world) if moves and dr.grad_enabled(self.to_world) else self._map
         lines = None
         if not flags & _FOLLOWS and (moves or dr.grad_enabled(ray.o, ray.d)):
-            o, ray_direction = to_world.inverse_point(vector3(ray.o)), to_world.inverse_direction(vector3(ray.d))
-            lines = Lines(o, ray_direction, kind == ON_LINE)
+            lines = Lines(to_world.inverse_point(ray_o), to_world.inverse_direction(ray_d), kind == ON_LINE)
         order = 2 if flags & _NORMAL_DERIVATIVES else 1
         points = kernel.at(location, active, order, constraint=lines, moves=moves, known=known)
         is_before = active & (dot(dr.detach(points.p) - hit, d) < 0)
         points = points.placed(to_world)
         if flags & _PARAMETERS:
             self._set_parameters(si, points, active)
-        self._fill_in(si, points, is_before, vector3(ray.o), vector3(ray.d), facing)
+        self._fill_in(si, points, is_before, ray_o, ray_d, side)
 
     def _count(self, kind: Index, active: Mask) -> None:
         """Count hits by kind and log the counts of the last kernel, at the log level Debug."""
@@ -281,9 +286,13 @@ class ExactShading:
         # Origin and direction of the ray
         o: Vector3,
         d: Vector3,
-        facing: Float,  # Negative where the ray hits the triangle from outside
+        side: Float,  # Negative where the ray hits the triangle from outside
     ) -> None:
-        """Set the normals, and the origin of rays that leave the surface."""
+        """Set the normals, and the origin of rays that leave the surface.
+
+        Emitters keep those of their triangles. Surfaces that rays pass through get the shading normal only; others also
+        the geometric normal, and a point in front of the triangle.
+        """
         variant, shape = self._variant, self._shape()
         # Emitters are sampled on their triangles. Hits need the same points and normals, or the weights of multiple
         # importance sampling would not sum to one.
@@ -291,7 +300,7 @@ class ExactShading:
             return
         exists = dot(points.n, points.n) > 0
         n = dr.select(exists, variant.Normal3f(points.n * self._sign), si.n)
-        n = _facing(n, dr.detach(d), facing)
+        n = _turned_to_ray(n, dr.detach(d), side)
         si.sh_frame.n = n
         # Where rays may pass through a material or into a medium, both sides need the same origin: the triangle.
         sides = 0 if shape is None else int(shape.bsdf().flags())
@@ -300,7 +309,7 @@ class ExactShading:
         is_outline = si.t == OUTLINE
         if sides & int(mi.BSDFFlags.BackSide):
             # Integrators replace normals that point away at outlines, as interpolated ones do on the front.
-            n = dr.select(is_outline & (facing > 0), -n, n)
+            n = dr.select(is_outline & (side > 0), -n, n)
             si.sh_frame.n = n
         # Otherwise, rays leave on the side that they came from. They start on the surface or on the triangle, whichever
         # is in front, so that no triangle occludes them.
@@ -326,7 +335,7 @@ class ExactShading:
             si.dn_du, si.dn_dv = (variant.Vector3f(tangent) for tangent in tangents[1])
 
 
-def _facing(n: Vector3, d: Vector3, facing: Float) -> Vector3:
+def _turned_to_ray(n: Vector3, d: Vector3, side: Float) -> Vector3:
     """Turn normals to the side of the triangle that a ray hits.
 
     Where a triangle extends beyond a silhouette, the surface nearby may face away from the ray, and would be black.
@@ -334,6 +343,6 @@ def _facing(n: Vector3, d: Vector3, facing: Float) -> Vector3:
     """
     detached, inverse = dr.detach(n), dr.rsqrt(dot(d, d))
     cosine = dot(detached, d) * inverse
-    target_cosine = dr.select(facing < 0, -GRAZING, GRAZING)
+    target_cosine = dr.select(side < 0, -GRAZING, GRAZING)
     turned = added(detached, d, (target_cosine - cosine) * inverse)
-    return dr.select(cosine * facing < 0, turned * dr.rsqrt(dot(turned, turned)), n)
+    return dr.select(cosine * side < 0, turned * dr.rsqrt(dot(turned, turned)), n)

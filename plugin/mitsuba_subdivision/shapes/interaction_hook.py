@@ -25,7 +25,7 @@ import sys
 import threading
 from collections.abc import Callable
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakKeyDictionary, WeakValueDictionary
 
 import drjit as dr
@@ -34,6 +34,7 @@ import mitsuba as mi
 from ..kernels.array_types import Mask, Value
 from ..variants import Variant, variant_name
 from .device_state import DeferredCollection, traversed
+from .exact_shading import TriangleHit
 from .machine_code import (
     BEFORE,
     address_of,
@@ -125,15 +126,6 @@ def interaction_hook(variant: Variant) -> InteractionHook:
     if isinstance(hook, str):
         raise RuntimeError(hook)
     return hook
-
-
-class TriangleHit(NamedTuple):
-    """Arguments of `mi.Shape.compute_surface_interaction`."""
-
-    ray: mi.Ray3f
-    preliminary: mi.PreliminaryIntersection3f
-    flags: int  # `mi.RayFlags`
-    active: Mask
 
 
 class InteractionHook:

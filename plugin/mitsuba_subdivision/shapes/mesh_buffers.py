@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 from weakref import WeakMethod
 
 import drjit as dr
@@ -22,9 +22,9 @@ from .placement import Placement
 if TYPE_CHECKING:
     from ..kernels.surface_kernel import SurfaceKernel
     from ..kernels.vertex_kernel import VertexKernel
-    from ..tessellation.attribute_table import AttributeLayout
+    from ..tessellation.attribute_table import AttributeLayout, AttributeTable
     from ..tessellation.vertex_table import VertexTable
-    from .displacement import ShapeDisplacement
+    from .displacement import DisplacedVertices, ShapeDisplacement
     from .exact_shading import ExactShading
     from .parameters import Parameters
 
@@ -32,6 +32,14 @@ if TYPE_CHECKING:
 # longer to trace than to compute, and more take memory.
 _LOADED: Shared[LaterArrays] = Shared()
 MOST_SHARED = 1 << 14
+
+
+class Triangles(NamedTuple):
+    """The triangles of a shape."""
+
+    table: VertexTable
+    attributes: AttributeTable  # At the vertices of the mesh, which have copies along seams of attributes
+    kept: IntArray | None  # (n,) int64: indices of the triangles of the mesh; None for all
 
 
 class MeshBuffers:
@@ -50,16 +58,16 @@ class MeshBuffers:
         variant: Variant,
         parameters: Parameters,
         placement: Placement,
+        surface: SurfaceKernel | None,  # The surface of hits and of displaced normals; None if neither needs it
         shading: ExactShading | None,
         displacement: ShapeDisplacement | None,
+        triangles: Triangles,
         # Method that is called with the gradients of the moving arrays, by name, after each reverse-mode pass
         on_backward: WeakMethod,
     ) -> None:
         self._variant, self._parameters, self._placement = variant, parameters, placement
-        self._shading, self._displacement, self._on_backward = shading, displacement, on_backward
-        # The surface of hits and of displaced normals; None if it is not needed.
-        evaluates = shading or displacement
-        self._surface: SurfaceKernel | None = None if evaluates is None else evaluates.kernel
+        self._surface, self._shading, self._on_backward = surface, shading, on_backward
+        self._displacement = displacement
         self._types = ArrayTypes(variant.Float) if dr.is_jit_v(variant.Float) else None
         self._is_sampled = parameters.is_sampled
         # Whether vertices are differentiable with respect to control points, placement and displacement.
@@ -68,15 +76,12 @@ class MeshBuffers:
             names = "control_points or to_world" if displacement is None else "control_points, to_world or heights"
             self.passes = BackwardPasses(parameters.source, names, variant.Float)
         self._evaluated: tuple[FloatBuffer, FloatBuffer] | None = None
+        self.retessellate(triangles)
 
-    def set_triangles(
-        self,
-        table: VertexTable,
-        layout: AttributeLayout,  # Vertices of the mesh, with or without copies along seams
-        kept: IntArray | None,  # (n,) int64: indices of the triangles of the mesh; None for all
-    ) -> None:
-        """Set the triangles, and the vertices to evaluate."""
-        self.table, self.layout, self._kept = table, layout, Content(kept)
+    def retessellate(self, triangles: Triangles) -> None:
+        """Choose the triangles, and the vertices to evaluate."""
+        self.table, self.layout, self._kept = triangles.table, triangles.attributes.layout, Content(triangles.kept)
+        table, layout = self.table, self.layout
         self._kernel: VertexKernel | None = None
         if self._types is not None and not self._is_sampled:
             from ..kernels.vertex_kernel import VertexKernel
@@ -90,8 +95,15 @@ class MeshBuffers:
         # Index of each vertex of the mesh among those of the tessellation, if seams have copies
         copied = layout.surface_vertex
         self._copied = copied if copied is None or self._types is None else self._types.indices(copied)
+        self._displaced: DisplacedVertices | None = None
         if self._displacement is not None:
-            self._displacement.set_triangles(layout, split_weld_targets(table, layout))
+            from .displacement import DisplacedVertices
+
+            has_normals = self._shading is None and not self._parameters.face_normals
+            weld_target = split_weld_targets(table, layout)
+            self._displaced = DisplacedVertices(
+                self._displacement, self._parameters, layout, weld_target, has_normals=has_normals
+            )
 
     def evaluated(
         self,
@@ -159,21 +171,22 @@ class MeshBuffers:
 
     def _placed(self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer) -> dict[str, FloatBuffer]:
         """Copy, displace and place vertices, and update exact shading."""
-        placement, shading = self._placement, self._shading
+        placement, surface, shading = self._placement, self._surface, self._shading
         positions, normals = self._split(positions), self._split(normals)
-        if self._displacement is not None:
-            positions, normals = self._displacement.displaced(positions, normals, points)
+        if self._displaced is not None:
+            positions, normals = self._displaced(positions, normals, points)
         if not placement.is_identity:
             positions, normals = placement.placed(positions, normals)
         moved = {"vertex_positions": positions, "vertex_normals": normals}
-        if shading is not None:
-            moved |= {"coefficients": shading.kernel.coefficients, "to_world": placement.matrix}
+        if surface is not None and shading is not None:
+            moved |= {"coefficients": surface.coefficients, "to_world": placement.matrix}
         if self.are_differentiable:
             attached = {name: array for name, array in moved.items() if dr.grad_enabled(array)}
             if attached:
                 moved |= self.passes.watched(attached, self._on_backward)
-        if shading is not None:
-            shading.set_transform(moved.pop("to_world"), moved.pop("coefficients"), placement)
+        if surface is not None and shading is not None:
+            surface.values.take(moved.pop("coefficients"))
+            shading.update(moved.pop("to_world"), placement)
         return moved
 
     def faces(self, *, are_turned: bool) -> IndexBuffer:

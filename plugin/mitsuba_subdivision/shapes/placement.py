@@ -57,6 +57,9 @@ class Placement:
         self,
         positions: NDArray[np.float64],  # (n, 3) float64: loaded control points
         float_type: type,  # Flat Dr.Jit array of the parameter ``control_points``
+        # Of `update`
+        to_world: mi.AffineTransform4f,
+        value: NDArray[np.float64],
         *,
         # Whether points may be recentred. Published forms are evaluated at the points as they are.
         recentres: bool,
@@ -72,8 +75,9 @@ class Placement:
             self._loaded = mapped(float_type, positions)
             self._relative = mapped(float_type, self.positions)
             self._centres = mapped(float_type, np.tile(centre, len(positions)))
+        self.update(to_world, value)
 
-    def take(
+    def update(
         self,
         to_world: mi.AffineTransform4f,
         # (4, 4) float64: its checked matrix. None while a frozen function is recorded, when it cannot be read: it is

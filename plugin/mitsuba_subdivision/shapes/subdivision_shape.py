@@ -17,7 +17,7 @@ from ..surface import TEXCOORDS
 from ..variants import Variant
 from .cage_attributes import PREFIX, CageAttributes, mesh_attributes, mesh_name
 from .device_state import DeviceState, flat_type, is_recording, paused_collection, require_values, traversed
-from .mesh_buffers import MeshBuffers
+from .mesh_buffers import MeshBuffers, Triangles
 from .outlines import seen_edges
 from .parameter_table import errors_about, plugin_page
 from .parameters import Parameters, Tessellation, read_parameters
@@ -25,6 +25,8 @@ from .placement import Placement, checked_matrix
 from .registration import on_shallow_stack
 
 if TYPE_CHECKING:
+    from ..kernels.channel_kernel import ChannelKernel
+    from ..kernels.surface_kernel import SurfaceKernel
     from .displacement import ShapeDisplacement
     from .exact_shading import ExactShading
 
@@ -56,44 +58,12 @@ def make_subdivision(
             parameters = read_parameters(props)
             surface, is_exact, kind = parameters.surface, _is_exact(parameters, variant), flat_type(variant)
             self._parameters, self._tessellation = parameters, parameters.tessellation
-            # The parameter of an adaptive tessellation's limit.
-            criterion = self._tessellation.criterion
-            self._error = kind([0.0 if criterion is None else criterion.error])
-            # Dr.Jit's variable indices of the mesh's buffers when they were last set, and their lengths.
-            self._evaluated: dict[str, int] = {}
-            self._lengths: dict[str, int] = {}
-            self._placement = Placement(surface.cage.positions, kind, recentres=parameters.evaluator == "stabilized")
-            self._exact: ExactShading | None = None
             self._has_texcoords = TEXCOORDS in surface.attribute_names
-            # Attributes at vertices.
+            # Attributes at vertices. Exact shading evaluates texture coordinates at hits, where seams need no copies of
+            # vertices. But Mitsuba samples textured emitters by those of the mesh.
             self._at_vertices = surface.attribute_names
-            if is_exact:
-                from .exact_shading import ExactShading
-
-                # Texture coordinates are evaluated at hits, so that their seams need no copies of vertices. But Mitsuba
-                # samples textured emitters by those of the mesh.
-                if not _has_textured_emitter(props, variant):
-                    self._at_vertices = tuple(name for name in self._at_vertices if name != TEXCOORDS)
-                self._exact = ExactShading(variant, parameters, self._placement.positions)
-            self._displacement: ShapeDisplacement | None = None
-            if parameters.displacement is not None:
-                from .displacement import ShapeDisplacement
-
-                with errors_about("displacement"):
-                    self._displacement = ShapeDisplacement(variant, parameters, self._placement.positions, self._exact)
-            attributes = mesh_attributes(surface.cage)
-            exposed = [name for name in (TEXCOORDS, *attributes) if name in surface.attribute_names]
-            drawn = self._exact, self._displacement
-            self._cage = CageAttributes(variant, surface, exposed, *drawn, WeakMethod(self.renew_attribute))
-            self._mesh = MeshBuffers(variant, parameters, self._placement, *drawn, WeakMethod(self.renew_derivatives))
-            self.control_points = mapped(kind, surface.cage.positions)
-            if is_jit:
-                # Copied to Dr.Jit's own memory, as frozen functions replace the array.
-                self.control_points = dr.opaque(self.control_points)
-            # From a list: with a NumPy array, the compiled kernel would depend on the alignment of its memory.
-            self.to_world = variant.AffineTransform4f(parameters.to_world.tolist())
-            self._prepare(surface.cage.positions, parameters.to_world)
-
+            if is_exact and not _has_textured_emitter(props, variant):
+                self._at_vertices = tuple(name for name in self._at_vertices if name != TEXCOORDS)
             super().__init__(
                 name=parameters.source,
                 vertex_count=0,
@@ -102,21 +72,86 @@ def make_subdivision(
                 has_vertex_normals=not (parameters.face_normals or is_exact),
                 has_vertex_texcoords=TEXCOORDS in self._at_vertices,
             )
-            if self._exact is not None:
+            # Parameters that users change. Arrays in Dr.Jit's own memory, as frozen functions replace them
+            self.control_points = mapped(kind, surface.cage.positions)
+            if is_jit:
+                self.control_points = dr.opaque(self.control_points)
+            # From a list: with a NumPy array, the compiled kernel would depend on the alignment of its memory.
+            self.to_world = variant.AffineTransform4f(parameters.to_world.tolist())
+            criterion = self._tessellation.criterion
+            # The limit of an adaptive tessellation
+            self._error = kind([0.0 if criterion is None else criterion.error])
+
+            self._placement = Placement(
+                surface.cage.positions,
+                kind,
+                self.to_world,
+                parameters.to_world,
+                recentres=parameters.evaluator == "stabilized",
+            )
+            # The surface of hits and of displaced normals, and the attributes that are evaluated at hits
+            on_device: SurfaceKernel | None = None
+            if is_exact or (is_jit and parameters.displacement is not None):
+                from ..kernels.surface_kernel import SurfaceKernel
+
+                on_device = SurfaceKernel(surface.pieces(), variant.Float)
+                on_device.values.load(self._placement.positions)
+            channels: dict[str, ChannelKernel] = {}
+            if is_exact:
+                from .exact_shading import channels_at_hits
+
+                channels = channels_at_hits(surface, variant.Float)
+            self._displacement: ShapeDisplacement | None = None
+            if parameters.displacement is not None:
+                from .displacement import ShapeDisplacement
+
+                with errors_about("displacement"):
+                    self._displacement = ShapeDisplacement(variant, parameters, on_device, channels)
+            triangles = self._triangles(surface.cage.positions, parameters.to_world)
+            self._exact: ExactShading | None = None
+            if on_device is not None and is_exact:
+                from .exact_shading import ExactShading
                 from .interaction_hook import interaction_hook
 
-                self._exact.follow(self)
+                self._exact = ExactShading(
+                    variant, self, surface.cage.source.name, on_device, channels, self._placement, triangles
+                )
                 interaction_hook(variant).attach(self, self._exact)
+            attributes = mesh_attributes(surface.cage)
+            self._cage = CageAttributes(
+                variant,
+                surface,
+                [name for name in (TEXCOORDS, *attributes) if name in surface.attribute_names],
+                channels,
+                self._displacement,
+                triangles.attributes,
+                self._at_vertices,
+                WeakMethod(self.renew_attribute),
+            )
+            self._mesh = MeshBuffers(
+                variant,
+                parameters,
+                self._placement,
+                on_device,
+                self._exact,
+                self._displacement,
+                triangles,
+                WeakMethod(self.renew_derivatives),
+            )
             self._device_state = DeviceState(self) if is_jit else None
             # Empty, because Mitsuba would convert values from a list one by one. `_assemble` sets the buffers.
             self.add_attribute("face_element", 1, [])
             for name, size in attributes.items():
                 self.add_attribute(mesh_name(name), size, [])
+            # Dr.Jit's variable indices of the mesh's buffers when they were last set, and their lengths
+            self._evaluated: dict[str, int] = {}
+            self._lengths: dict[str, int] = {}
+            # The triangles over texture coordinates; None until they are needed. Frozen functions find its arrays here.
+            self._texture_scene: Any = None
             self._assemble(moves_points=False)
 
-        def _prepare(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> None:
-            """Place the shape, and select its triangles and the evaluator of their vertices."""
-            self._placement.take(self.to_world, to_world)
+        def _triangles(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> Triangles:
+            """Select the triangles for control points and a transformation."""
             parameters, surface = self._parameters, self._parameters.surface
             is_adaptive = self._tessellation.limit is not None
             bound = self._displacement.bound(to_world) if self._displacement is not None and is_adaptive else None
@@ -124,14 +159,7 @@ def make_subdivision(
             kept = None if parameters.shown is None else np.flatnonzero(parameters.shown[table.element])
             # Displaced vertices are averaged over copies along all seams.
             names = self._at_vertices if self._displacement is None else None
-            attributes = surface.attribute_table(table, names)
-            if self._exact is not None:
-                self._exact.set_triangles(table, kept)
-            self._cage.set_triangles(attributes, self._at_vertices)
-            self._mesh.set_triangles(table, attributes.layout, kept)
-            self._has_outlines = False
-            # The triangles over texture coordinates; None until they are needed. Frozen functions find its arrays here.
-            self._texture_scene: Any = None
+            return Triangles(table, surface.attribute_table(table, names), kept)
 
         def _assemble(self, *, moves_points: bool) -> None:
             """Fill all buffers of the mesh."""
@@ -142,6 +170,7 @@ def make_subdivision(
             faces = self._mesh.faces(are_turned=self._has_turned_faces)
             buffers |= {"faces": faces, "face_element": self._mesh.element, **self._cage.buffers()}
             self._built = list(buffers)
+            self._has_outlines = False
             self._set_buffers(buffers)
             super().parameters_changed(self._built)
 
@@ -154,7 +183,14 @@ def make_subdivision(
             self._require_unfrozen()
             self._require_control_points(are_new=True)
             points = np.array(self.control_points, dtype=np.float64).reshape(-1, 3)
-            self._prepare(points, checked_matrix(self.to_world))
+            to_world = checked_matrix(self.to_world)
+            self._placement.update(self.to_world, to_world)
+            triangles = self._triangles(points, to_world)
+            if self._exact is not None:
+                self._exact.retessellate(triangles)
+            self._cage.retessellate(triangles.attributes, self._at_vertices)
+            self._mesh.retessellate(triangles)
+            self._texture_scene = None
             self._assemble(moves_points=True)
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
@@ -191,7 +227,7 @@ def make_subdivision(
                 self.retessellate()
                 return
             if "to_world" in keys:
-                self._placement.take(self.to_world, to_world)
+                self._placement.update(self.to_world, to_world)
             buffers = self._mesh.evaluated(self.control_points, moves_points="control_points" in keys)
             buffers |= self._cage.buffers(attributes)
             if self._placement.mirrors != self._has_turned_faces:
