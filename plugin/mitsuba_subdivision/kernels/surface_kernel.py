@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import numpy as np
@@ -14,13 +15,15 @@ from ..patches.area_samples import SamplingCells
 from ..patches.piece_table import PieceTable
 from .algebra import AffineMap, cross, over, unit
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector3
-from .displacement import Displacement
 from .line_intersection import MISSED, ON_LINE, Lines, line_hits
 from .linear_maps import CoefficientMap, ControlValues
 from .locations import Location
-from .nearest_points import NearestPoints, nearest_locations
 from .piece_kernel import PatchValues, Piece, PieceKernel, differences
 from .vertex_kernel import coordinates_expected
+
+if TYPE_CHECKING:
+    from .displacement import Displacement
+    from .nearest_points import NearestPoints
 
 # Largest distance of a hit from its line, relative to the longest derivative of the surface; used by `intersect`.
 NEAR_LINE = 1e-4
@@ -209,6 +212,8 @@ class SurfaceKernel:
         element, uv, corner, derivatives
             As for `evaluate`: starting point of the search.
         """
+        from .nearest_points import nearest_locations
+
         points = self.types.converted(self.types.vector3, points)
         start = dr.detach(self._location(element, uv, corner))
         piece_at = partial(self._patches.piece, dr.detach(self.coefficients))
