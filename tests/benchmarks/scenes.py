@@ -92,16 +92,16 @@ def _show_further(few, many):
 
 def hits(clock, shading, repeats, cage):
     shape = _shape(cage, shading, RATES[shading], bsdf={"type": "roughconductor", "alpha": 0.2})
-    _pictures(clock, _scene({"shape": shape}, 256, 64), repeats)
+    _pictures(clock, scene_around({"shape": shape}, 256, 64), repeats)
 
 
 def shapes(clock, shading, repeats, count):
-    _pictures(clock, _scene(_spread(shading, SIX_CAGES, count), 64, 4), repeats)
+    _pictures(clock, scene_around(spread(shading, SIX_CAGES, count), 64, 4), repeats)
 
 
 def instances(clock, shading, repeats, shape_count=7, instance_count=64, group_count=1, *, samples=4):
     """Shapes and instances of one cage, the latter of several groups in turn."""
-    placed = list(_spread(shading, ["star"], shape_count + instance_count).items())
+    placed = list(spread(shading, ["star"], shape_count + instance_count).items())
     entries = dict(placed[:shape_count])
     for number in range(group_count):
         # Mitsuba would make one of equal groups.
@@ -109,7 +109,7 @@ def instances(clock, shading, repeats, shape_count=7, instance_count=64, group_c
     for number, (name, shape) in enumerate(placed[shape_count:]):
         group = {"type": "ref", "id": f"group_{number % group_count}"}
         entries[f"of_{name}"] = {"type": "instance", "group": group, "to_world": shape["to_world"]}
-    _pictures(clock, _scene(entries, 64, samples), repeats)
+    _pictures(clock, scene_around(entries, 64, samples), repeats)
 
 
 def growth(clock, shading, repeats, *counts):
@@ -153,7 +153,7 @@ def gradients(clock, shading, repeats, cage):
     """A step of a fit: render, differentiate by control points, update."""
     shape = _shape(cage, shading, RATES[shading], bsdf={"type": "diffuse"})
     clock.lap()
-    scene = mi.load_dict(_scene({"shape": shape}, 128, 16, {"type": "prb", "max_depth": 3}))
+    scene = mi.load_dict(scene_around({"shape": shape}, 128, 16, {"type": "prb", "max_depth": 3}))
     parameters = mi.traverse(scene)
     (key,) = (key for key in parameters.keys() if key.endswith("control_points"))  # noqa: SIM118
     dr.sync_thread()
@@ -191,7 +191,7 @@ def _pictures(clock, scene, repeats):
         clock.lap("next" if number else "first")
 
 
-def _scene(shapes, size, spp, integrator=None):
+def scene_around(shapes, size, spp, integrator=None):
     """Shapes around the origin, in a box of half a side 1.5, seen from the front."""
     camera = {"fov": 30, "to_world": mi.ScalarTransform4f().look_at([2, -6, 3], [0, 0, 0], [0, 0, 1])}
     film = {"type": "hdrfilm", "width": size, "height": size, "rfilter": {"type": "box"}}
@@ -206,7 +206,7 @@ def _scene(shapes, size, spp, integrator=None):
     }
 
 
-def _spread(shading, cages, count):
+def spread(shading, cages, count):
     """So many shapes, at equal distances in a square, their cages in turn."""
     side = int(np.ceil(np.sqrt(count)))
     places = (np.stack(np.divmod(np.arange(count), side), axis=1) + 0.5) * 2 / side - 1

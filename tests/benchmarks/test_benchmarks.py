@@ -40,6 +40,7 @@ def test_benchmarks_of_the_smallest_cage_run(tmp_path):
     [
         ("first_picture.py --repeats 1 --variants scalar_rgb --rate 2", "star, scalar_rgb"),
         ("samples.py --samples 100 --rate 2 --repeats 2", "times a vertex of the tessellation"),
+        pytest.param("steps.py --counts 1 --repeats 1", "1, exact", marks=needs_llvm),
         pytest.param("scenes.py growth --growth 1,2,2 --repeats 1", "compiled: next", marks=needs_llvm),
     ],
 )

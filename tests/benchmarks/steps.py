@@ -1,0 +1,86 @@
+"""Steps of inverse rendering with many shapes: `mi.Mesh` of the same triangles, vertex shading, exact shading.
+
+python tests/benchmarks/steps.py [--counts 16 64] [--repeats 5]
+
+A step is a picture of `prb`, 64 by 64 pixels with 4 samples, whose gradients come to the control points of all shapes,
+or to the vertices of the meshes; then all of these move. In the last column, the picture and its gradients are within a
+frozen function. Milliseconds of all processors, the median of the repeats after the first.
+"""
+
+import argparse
+import time
+
+# Before Dr.Jit, so that it finds an LLVM library that works; it registers the shape, too.
+import mitsuba_subdivision  # noqa: F401
+
+# isort: split
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from processes import print_row
+
+from scenes import SIX_CAGES, scene_around, spread
+
+KINDS = {"mesh": "vertex_positions", "vertex": "control_points", "exact": "control_points"}
+
+
+def scene_of(kind, count):
+    """A scene of so many shapes, and its parameters that move."""
+    shapes = spread("exact" if kind == "exact" else "vertex", SIX_CAGES, count)
+    if kind == "mesh":
+        shapes = {name: mesh_of(name, shape) for name, shape in shapes.items()}
+    scene = mi.load_dict(scene_around(shapes, 64, 4, {"type": "prb", "max_depth": 3}))
+    parameters = mi.traverse(scene)
+    parameters.keep([key for key in parameters.keys() if key.endswith(KINDS[kind])])  # noqa: SIM118
+    return scene, parameters
+
+
+def mesh_of(name, shape):
+    """A mesh with the triangles of a shape."""
+    given = mi.load_dict(shape)
+    mesh = mi.Mesh(name, given.vertex_count(), given.face_count(), has_vertex_normals=True)
+    source, target = mi.traverse(given), mi.traverse(mesh)
+    for key in ("vertex_positions", "vertex_normals", "faces"):
+        target[key] = source[key]
+    target.update()
+    return mesh
+
+
+def milliseconds(kind, count, repeats, *, is_frozen):
+    """Of a step."""
+    scene, parameters = scene_of(kind, count)
+
+    def gradients(scene, parameters, seed):
+        dr.backward(dr.mean(mi.render(scene, parameters, seed=seed, spp=4) ** 2, axis=None))
+
+    apply, start, taken = dr.freeze(gradients) if is_frozen else gradients, dict(parameters), []
+    for step in range(repeats + 3):
+        begun = time.process_time()
+        for key, value in start.items():
+            moved = dr.opaque(type(value), 0) + dr.detach(value) + dr.opaque(mi.Float, 1e-4 * step)
+            dr.enable_grad(moved)
+            parameters[key] = moved
+        parameters.update()
+        apply(scene, parameters, dr.opaque(mi.UInt32, step))
+        dr.eval([dr.grad(parameters[key]) for key in start])
+        dr.sync_thread()
+        taken.append(time.process_time() - begun)
+    # A frozen function is recorded twice.
+    return np.median(taken[3:]) * 1e3
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--counts", nargs="+", type=int, default=[16, 64])
+    parser.add_argument("--repeats", type=int, default=5)
+    options = parser.parse_args()
+    mi.set_variant("llvm_ad_rgb")
+    print_row("shapes", "ms a step", "frozen")
+    for count in options.counts:
+        for kind in KINDS:
+            plain, frozen = (milliseconds(kind, count, options.repeats, is_frozen=each) for each in (False, True))
+            print_row(f"{count}, {kind}", f"{plain:.0f}", f"{frozen:.0f}")
+
+
+if __name__ == "__main__":
+    main()
