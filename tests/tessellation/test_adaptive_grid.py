@@ -191,7 +191,7 @@ def test_edges_are_features_where_faces_lie_back_to_back(cage, is_folded):
     """Not where they are at right angles."""
     surface = LimitSurface(cage)
     vertex = surface.cage.cut_mesh.vertex
-    frames, criterion = PatchFrames.of(surface.patches, vertex), Criterion(Measure.CHORD, 1e-3)
+    frames, criterion = PatchFrames.of(surface.patches), Criterion(Measure.CHORD, 1e-3)
     assert (feature_edges(surface.patches, frames, cage.positions[vertex], criterion) == is_folded).all()
 
 

@@ -129,7 +129,7 @@ def test_a_tile_without_a_normal_is_no_smaller_than_it_is():
     positions = np.ones((cage.vertex_count, 3))
     positions[[faces[face, (corner + 2) % 4] for face, corner in np.argwhere(faces == center)]] = -1
     surface = LimitSurface(cage.with_positions(positions), scheme)
-    frames = PatchFrames.of(surface.patches, surface.cage.cut_mesh.vertex)
+    frames = PatchFrames.of(surface.patches)
     error, larger = np.linalg.norm(np.ptp(positions, axis=0)) * (1 + ROUNDING), 0
     rates = TileRates(scheme, frames, Criterion(Measure.CHORD, error), 64)
     for tile, values, samples in tiles_of(surface, scheme):

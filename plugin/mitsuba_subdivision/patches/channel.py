@@ -84,8 +84,8 @@ class Channel:
     def weights(self, half_edge: IntArray, uv: FloatArray) -> sparse.csr_array:
         """``(s, n)`` weights of the values at samples; rows sum to one."""
         if not self.layout.is_linear:
-            indices = self.layout.value_index, len(self.values)
-            return stencil_matrices(self.layout.patches, *indices, half_edge, uv, limit_stencils, 1)[0]
+            patches, values = self.layout.patches, (self.layout.value_index, len(self.values))
+            return stencil_matrices(patches, half_edge, uv, limit_stencils, 1, *values)[0]
         from scipy import sparse
 
         rows, (weights, *_) = self._linear_terms(half_edge, uv)

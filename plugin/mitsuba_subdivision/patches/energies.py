@@ -17,7 +17,6 @@ from ..evaluation.eigenbasis import CLUSTER_WIDTH
 from ..evaluation.irregular_patch import IrregularPatch, level_rows
 from ..evaluation.patch_tree import patch_trees
 from ..evaluation.polynomials import polynomial_basis
-from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature
 from ..messages import counted
 from ..schemes.domain import FloatArray
@@ -40,7 +39,6 @@ Density = Callable[[FloatArray, FloatArray], FloatArray]
 
 def energy_matrix(
     patches: PatchTable,
-    control_of_vertex: IntArray,  # (n_v,) int64: 0-based control point at each mesh vertex
     control_points: FloatArray,  # (n, 3) float64
     density: Density,
     order: int,  # Gauss nodes along each parameter of a piece
@@ -48,8 +46,8 @@ def energy_matrix(
     """Integrate an energy over a surface. Returns a symmetric (n, n) CSR array of float64."""
     from scipy import sparse
 
-    controls, refinement = patches.control_rows(control_of_vertex, len(control_points))
-    table = patches if patches.refined is None else patches.refined.table
+    controls, refinement = patches.control_rows()
+    table = patches.evaluated
     points = control_points if refinement is None else refinement @ control_points
     total = sparse.csr_array((len(points), len(points)))
     for patch_class in counted(table.classes, "Energies of patch classes"):

@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..evaluation.patch_tree import PatchTree, patch_trees
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.one_ring import RingTable, one_rings
 from ..mesh.shared import Content, Shared
 from ..mesh.signature import Signature, fan_codes, row_codes, signatures_at
+from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 
 if TYPE_CHECKING:
@@ -61,12 +63,19 @@ class PatchTable:
         topology: Topology,  # The mesh: the cage, cut along its creases
         scheme: Scheme,
         is_hole: NDArray[np.bool_] | None = None,  # (n_f,) bool: faces that are no elements
+        # (n_v,) int64: 0-based control point at each mesh vertex, and number of control points. By default mesh
+        # vertices are control points.
+        control_of_vertex: IntArray | None = None,
+        control_count: int | None = None,
         *,
         # Whether a patch may begin at any corner of its element, so that elements whose one-rings are equal up to
         # rotation share a class. If not, a patch begins at its element's first corner.
         may_turn: bool = True,
     ) -> None:
         self.topology, self.scheme, self.is_hole, self.may_turn = topology, scheme, is_hole, may_turn
+        count = topology.vertex_count
+        self.control_of_vertex = np.arange(count) if control_of_vertex is None else control_of_vertex
+        self.control_count = count if control_count is None else control_count
         # The mesh whose faces are the elements: the cage's mesh, or its dual, whose vertices are the cage's faces. A
         # face of the dual begins at the lowest half-edge of its vertex. Holes and border vertices, which are no
         # elements, become faces without corners.
@@ -102,11 +111,6 @@ class PatchTable:
         """`PatchClass.controls` of all classes, flat."""
         return self.rings.vertices
 
-    @property
-    def control_counts(self) -> IntArray:
-        """``(c,)`` K, the number of control points of a patch, of each class."""
-        return self.rings.vertex_counts
-
     @cached_property
     def _signatures(self) -> list[Signature]:
         first = self._patch_codes[0][self._order[0][[0, *self._order[1]]]]
@@ -117,9 +121,8 @@ class PatchTable:
     @cached_property
     def rings(self) -> RingTable:
         """The one-rings of all patches, class by class."""
-        order, bounds = self._order
-        half_edges = self.half_edge_of_corner[self._patch_codes[0][order]]
-        return RingTable(self.topology, one_rings(self._signatures), half_edges, np.diff([0, *bounds, len(order)]))
+        half_edges = self.half_edge_of_corner[self._patch_codes[0][self._order[0]]]
+        return RingTable(self.topology, one_rings(self._signatures), half_edges, self.patch_counts)
 
     def forget(self) -> None:
         """Drop what is computed again on demand, for a mesh that nothing is evaluated on but kernels made of it."""
@@ -136,6 +139,16 @@ class PatchTable:
     @property
     def class_count(self) -> int:
         return len(self._order[1]) + 1
+
+    @property
+    def patch_counts(self) -> IntArray:
+        """``(c,)`` number of patches of each class."""
+        return np.diff([0, *self._order[1], self.patch_count])
+
+    @property
+    def trees(self) -> list[PatchTree]:
+        """The completely divided patch tree of each class. One call makes all, as they share most of their data."""
+        return patch_trees(self.scheme, [patch_class.signature for patch_class in self.classes])
 
     @cached_property
     def _order(self) -> tuple[IntArray, IntArray]:
@@ -160,12 +173,35 @@ class PatchTable:
             return None
         return RefinedPatches(table, refinement.stencils.matrix)
 
+    @property
+    def evaluated(self) -> PatchTable:
+        """The table whose patches are evaluated: that of the cage refined once, or this one."""
+        return self if self.refined is None else self.refined.table
+
+    def places(self, patch_class: PatchClass) -> IndexArray:
+        """``(p,)`` the corner of the element that each patch of `evaluated` covers, a half-edge of `elements`."""
+        # As the scheme `splits_corners`, face h of the refined cage lies at half-edge h of the cage, and begins there.
+        return patch_class.corners if self.refined is None else self.evaluated.topology.face[patch_class.corners]
+
+    def evaluated_at(self, corners: IntArray) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """`patch_at` in `evaluated`, for half-edges of this table's `elements` at which its patches begin."""
+        return self.evaluated.patch_at(
+            corners if self.refined is None else self.evaluated.topology.face_offsets[corners]
+        )
+
+    def evaluated_points(self, points: FloatArray) -> FloatArray:
+        """``(n, k)`` values at the vertices of the mesh of `evaluated`, from those at this table's mesh vertices."""
+        return points if self.refined is None else self.refined.matrix @ points
+
     def control_rows(
         self,
-        control_of_vertex: IntArray,  # (n_v,) int64: 0-based control value at each mesh vertex
-        control_count: int,
+        # By default those of the table
+        control_of_vertex: IntArray | None = None,
+        control_count: int = 0,
     ) -> tuple[NDArray[np.uint32], sparse.csr_array | None]:
         """`controls` as rows of control values; for refined patches, also the matrix that refines the cage's values."""
+        if control_of_vertex is None:
+            control_of_vertex, control_count = self.control_of_vertex, self.control_count
         refined = self.refined
         if refined is not None:
             from scipy import sparse
@@ -193,10 +229,10 @@ class PatchTable:
     @cached_property
     def _patch_of_corner(self) -> tuple[IntArray, IndexArray, NDArray[np.int8]]:
         """`patch_at` for all half-edges, in small integer types, as a cage may have millions of them."""
-        t, (order, bounds) = self.elements, self._order
+        t = self.elements
         dtypes = np.min_scalar_type(-self.class_count), np.int32, np.int8
         class_index, patch, patch_corner = (np.full(t.half_edge_count, -1, dtype=dtype) for dtype in dtypes)
-        corners, counts = self._patch_codes[0][order], np.diff([0, *bounds, len(order)])
+        corners, counts = self._patch_codes[0][self._order[0]], self.patch_counts
         in_class, index = np.repeat(np.arange(len(counts)), counts), ragged.index_in_row(counts)
         for turn in range(self.scheme.domain.corner_count):
             class_index[corners], patch[corners], patch_corner[corners] = in_class, index, turn
@@ -267,8 +303,3 @@ class RefinedPatches:
 
     table: PatchTable  # Of the refined cage, whose faces are all elements, and whole
     matrix: sparse.csr_array  # (n, n_v) weights of the mesh's vertices at the refined cage's vertices
-
-    def corners(self, patch_class: PatchClass) -> IndexArray:
-        """``(p,)`` the corner of the cage's element that each patch covers, a half-edge of the cage's `elements`."""
-        # As the scheme `splits_corners`, face h of the refined cage lies at half-edge h of the cage, and begins there.
-        return self.table.topology.face[patch_class.corners]

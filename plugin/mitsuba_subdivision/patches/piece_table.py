@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from ..evaluation.equations import times_matrix
 from ..evaluation.irregular_patch import LEVEL_PIECES, PIECE_LEVELS, IrregularPatch, float32_levels, level_polynomials
-from ..evaluation.patch_tree import PartKind, PatchTree, patch_trees
+from ..evaluation.patch_tree import PartKind, PatchTree
 from ..evaluation.polynomials import polynomial_basis
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
@@ -59,6 +59,11 @@ COEFFICIENT_BYTES = 1 << 26
 # Maximum number of pieces of a part whose coefficients are stored as a whole. Larger elements are split into parts:
 # along semi-sharp creases there are thousands of parts of few kinds, which share coefficients.
 SHARED_PIECES = 64
+
+
+# Rows of `PieceTable.classes`: index of the first entry in `controls`; numbers of patches and of controls per patch;
+# first piece, and number of pieces per patch.
+CLASS = np.dtype([(name, np.int64) for name in ("first_control", "patches", "controls", "first_piece", "pieces")])
 
 
 class FrameKind(IntEnum):
@@ -127,9 +132,7 @@ class PieceTable:
     nodes: NDArray[np.uint32]
     elements: tuple[PatchTree, ...]  # Of each class
     tips: tuple[Tip, ...]  # Different ones of all classes
-    # (c, 5) uint32, for each class: index of its first entry in `controls`; number of patches, and of controls per
-    # patch; first piece; number of pieces per patch
-    classes: NDArray[np.uint32]
+    classes: NDArray[np.void]  # (c,) of type `CLASS`
     control_of_vertex: IntArray  # (n_v,) int64: 0-based control value at each mesh vertex
     # (n, control_count) matrix from control values to refined ones, if patches are those of the cage refined once
     refinement: sparse.csr_array | None
@@ -138,24 +141,25 @@ class PieceTable:
     def build(
         cls,
         patches: PatchTable,
-        control_of_vertex: IntArray,  # (n_v,) int64: 0-based control value at each mesh vertex
-        control_count: int,
+        # As for `PatchTable`, by default its own
+        control_of_vertex: IntArray | None = None,
+        control_count: int = 0,
         # Number of levels of tips that are stored as pieces; fewer where these exceed COEFFICIENT_BYTES
         piece_levels: int = PIECE_LEVELS,
     ) -> PieceTable:
         """Prepare the evaluation of patches. Calls with equal arguments share the object while it is referenced."""
+        if control_of_vertex is None:
+            control_of_vertex, control_count = patches.control_of_vertex, patches.control_count
+        controls = control_of_vertex, control_count
         key = patches, Content(control_of_vertex), control_count, piece_levels
-        return _TABLES.get(key, lambda: cls._build(patches, control_of_vertex, control_count, piece_levels))
+        return _TABLES.get(key, lambda: cls._build(patches, *controls, piece_levels))
 
     @classmethod
     def _build(
         cls, patches: PatchTable, control_of_vertex: IntArray, control_count: int, piece_levels: int
     ) -> PieceTable:
-        refined = patches.refined
-        table = patches if refined is None else refined.table
-        counts, control_counts = np.array([len(kind.corners) for kind in table.classes]), table.control_counts
-        # Building all trees in one call shares most of their data.
-        elements = patch_trees(table.scheme, [kind.signature for kind in table.classes])
+        table = patches.evaluated
+        counts, elements = table.patch_counts, table.trees
         tip_count = int(np.array([element.tip_count for element in elements]) @ counts)
         packet_count = piece_packets(len(polynomial_basis(table.scheme).powers)) * LEVEL_PIECES * tip_count
         bytes_of_level = 4 * PACKET * packet_count
@@ -164,7 +168,7 @@ class PieceTable:
         trees = [tree_arrays(element, piece_levels) for element in counted(elements, "Pieces of patch classes")]
         sizes = np.array([tree.piece_count for tree in trees])
         first_pieces, piece_count = ragged.starts(sizes * counts), int(sizes @ counts)
-        columns = [kind.first_control for kind in table.classes], counts, control_counts, first_pieces, sizes
+        columns = table.rings.offsets[:-1], counts, table.rings.vertex_counts, first_pieces, sizes
         node_counts = np.array([len(tree.nodes) for tree in trees])
         first_nodes, nodes = ragged.starts(node_counts), np.concatenate([tree.nodes for tree in trees])
         every_tip = [tip for tree in trees for tip in tree.tips]
@@ -186,7 +190,7 @@ class PieceTable:
             nodes.astype(np.uint32),
             tuple(elements),
             tips,
-            np.stack(columns, axis=1).astype(np.uint32),
+            np.array([*zip(*columns, strict=True)], dtype=CLASS),
             control_of_vertex,
             patches.control_rows(control_of_vertex, control_count)[1],
         )
@@ -209,15 +213,10 @@ class PieceTable:
         `PATCH` times the index of the patch, plus `WHOLE` if the element is whole, plus `PATCH_CORNER` times the corner
         of the patch at which the half-edge begins, plus the corner of the element if that is whole, else 0.
         """
-        patches = self.patches
-        t, refined = patches.elements, patches.refined
+        patches, t = self.patches, self.patches.elements
         half_edge = np.arange(t.half_edge_count, dtype=np.int32)
-        # Face h of the cage refined once lies at half-edge h of the cage, and begins there.
-        table = patches if refined is None else refined.table
-        patch_half_edge = half_edge if refined is None else table.topology.face_offsets[:-1]
-        class_index, patch, patch_corner = table.patch_at(patch_half_edge)
-        first_patch = ragged.starts(np.array([len(patch_class.corners) for patch_class in table.classes]))
-        face = t.face[half_edge]
+        class_index, patch, patch_corner = patches.evaluated_at(half_edge)
+        first_patch, face = ragged.starts(patches.evaluated.patch_counts), t.face
         is_whole = patches.is_whole[face]
         columns = np.empty((len(half_edge), 4), dtype=np.uint32)
         columns[:, TWIN] = np.where(t.twin < 0, NOTHING, t.twin.astype(np.int64))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.irregular_patch import IrregularPatch, level_at_size, level_domains, level_rows, rest_rows
-from ..evaluation.patch_tree import PatchTree, patch_trees
+from ..evaluation.patch_tree import PatchTree
 from ..evaluation.polynomials import BernsteinBasis, polynomial_basis, times
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..messages import counted
@@ -184,16 +184,11 @@ class SurfacePieces:
         control_points: FloatArray,  # (n_v, 3) float64: at each mesh vertex
     ) -> SurfacePieces:
         """Divide all elements."""
-        refined = patches.refined
-        table = patches if refined is None else refined.table
-        if refined is not None:
-            control_points = refined.matrix @ control_points
+        table, points = patches.evaluated, patches.evaluated_points(control_points)
         form, sizes = polynomial_basis(table.scheme), np.zeros((len(patches.elements.face_sizes), 3))
-        trees = patch_trees(table.scheme, [patch_class.signature for patch_class in table.classes])
         regular, tips, known = [], dict[IrregularPatch, list[Tips]](), dict[PatchTree, FloatArray]()
-        for patch_class, tree in counted(list(zip(table.classes, trees, strict=True)), "Pieces of patch classes"):
-            controls = control_points[patch_class.controls]
-            corners = patch_class.corners if refined is None else refined.corners(patch_class)
+        for patch_class, tree in counted(list(zip(table.classes, table.trees, strict=True)), "Pieces of patch classes"):
+            controls, corners = points[patch_class.controls], patches.places(patch_class)
             np.maximum.at(sizes, patches.elements.face[corners], np.abs(controls).max(axis=1))
             half_edge, matrices, offsets = _places(patches, corners, tree)
             rows = tree.coefficients(form.of_controls, known)

@@ -9,10 +9,8 @@ import numpy as np
 
 from ..cage.errors import warn
 from ..evaluation.divided_tile import DividedTile, part_of_tile
-from ..evaluation.patch_tree import patch_trees
 from ..evaluation.polynomials import times
 from ..mesh import ragged
-from ..mesh.connectivity import IntArray
 from ..messages import counted
 from ..patches.patch_table import PatchTable
 from ..schemes.domain import FloatArray
@@ -31,7 +29,6 @@ TILES_AT_ONCE, PARTS_AT_ONCE = 1 << 10, 1 << 7
 
 def adaptive_table(
     patches: PatchTable,
-    control_of_vertex: IntArray,  # (n_v,) int64: 0-based control point at each mesh vertex
     # (n, 3) float64: control points at which the criterion holds. The table can be applied to others.
     control_points: FloatArray,
     criterion: Criterion,
@@ -48,22 +45,18 @@ def adaptive_table(
     max_rate = checked_rate(max_rate, "max_rate")
     if max_rate > HIGHEST_RATE:
         raise ValueError(f"max_rate {max_rate}; expected at most {HIGHEST_RATE} segments per edge")
-    frames = PatchFrames.of(patches, control_of_vertex)
+    frames = PatchFrames.of(patches)
     rates = TileRates(patches.scheme, frames, criterion, max_rate)
-    grid = AdaptiveGrid.of(_chosen(patches, rates, control_points[control_of_vertex], cage_name), frames)
-    controls, refinement = patches.control_rows(control_of_vertex, len(control_points))
-    polynomials = _polynomials(patches, grid)
-    return VertexTable(len(control_points), patches.patch_count, grid, polynomials, controls, grid.copies(), refinement)
+    grid = AdaptiveGrid.of(_chosen(patches, rates, control_points[patches.control_of_vertex], cage_name), frames)
+    polynomials, (controls, refinement) = _polynomials(patches, grid), patches.control_rows()
+    counts = patches.control_count, patches.patch_count
+    return VertexTable(*counts, grid, polynomials, controls, grid.copies(), refinement)
 
 
 def _polynomials(patches: PatchTable, grid: AdaptiveGrid) -> tuple[VertexPolynomials, ...]:
     """The polynomials on which vertices lie. Vertices at equal parameters of patches of one class share a sample."""
-    refined = patches.refined
-    table = patches if refined is None else refined.table
-    tile, uv = grid.parameters()
-    corner = grid.tiles["corner"][tile]
-    # Face h of the cage refined once lies at half-edge h of the cage, and begins there.
-    patch_class, patch, _ = table.patch_at(corner if refined is None else table.topology.face_offsets[corner])
+    table, (tile, uv) = patches.evaluated, grid.parameters()
+    patch_class, patch, _ = patches.evaluated_at(grid.tiles["corner"][tile])
     order = np.lexsort((*uv, patch_class))
     is_new = (np.diff(uv[:, order], prepend=-1) != 0).any(axis=0) | (np.diff(patch_class[order], prepend=-1) != 0)
     distinct = order[is_new]
@@ -114,13 +107,10 @@ def _warn_of_coarse(patches: PatchTable, needed: Tiles, tiles: Tiles, max_rate: 
 
 def _whole_patches(patches: PatchTable, rates: TileRates, points: FloatArray) -> Iterator[Part]:
     """Iterate over all patches, each as one tile."""
-    refined, features = patches.refined, feature_edges(patches, rates.frames, points, rates.criterion)
-    table, points = (patches, points) if refined is None else (refined.table, refined.matrix @ points)
-    coordinates = np.ascontiguousarray(points.T)
-    elements = patch_trees(table.scheme, [patch_class.signature for patch_class in table.classes])
-    pairs = list(zip(table.classes, elements, strict=True))
-    corners = [kind.corners if refined is None else refined.corners(kind) for kind in table.classes]
-    tiles = whole_patches(np.concatenate(corners), rates.frames.domain.corner_count)
+    table, features = patches.evaluated, feature_edges(patches, rates.frames, points, rates.criterion)
+    coordinates = np.ascontiguousarray(patches.evaluated_points(points).T)
+    pairs = list(zip(table.classes, table.trees, strict=True))
+    tiles = whole_patches(np.concatenate(list(map(patches.places, table.classes))), rates.frames.domain.corner_count)
     half_edge = sides_of(tiles, rates.frames, 0).half_edge.reshape(tiles["sides"].shape)
     tiles["sides"] = (half_edge >= 0) & features[half_edge]
     for patch_class, element in counted(pairs, "Tiles of patch classes"):

@@ -50,13 +50,9 @@ class PatchFrames:
     has_copies: bool  # Whether several edges or vertices of the topology have the same number
 
     @classmethod
-    def of(
-        cls,
-        patches: PatchTable,
-        control_of_vertex: IntArray,  # (n_v,) int64: 0-based control point at each mesh vertex
-    ) -> PatchFrames:
+    def of(cls, patches: PatchTable) -> PatchFrames:
         """The frames of a table's patches."""
-        t, is_split = patches.elements, patches.refined is not None
+        t, is_split, control_of_vertex = patches.elements, patches.refined is not None, patches.control_of_vertex
         is_whole = patches.is_whole & (not is_split)
         scale = np.where(patches.is_whole & is_split, 0.5, 1.0)
         half_edge = np.arange(t.half_edge_count, dtype=np.int32)

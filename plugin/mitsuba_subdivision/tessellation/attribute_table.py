@@ -61,14 +61,12 @@ class AttributeTable:
     def build(
         cls,
         table: VertexTable,  # Of the tessellation
-        # The inputs that the table was built from
-        patches: PatchTable,
-        control_of_vertex: IntArray,
+        patches: PatchTable,  # That the table was built from
         channels: Mapping[str, Channel],
     ) -> AttributeTable:
         """Evaluate attributes in float64."""
         layouts = tuple(channel.layout for channel in channels.values())
-        layout = _LAYOUTS.get((table, *layouts), lambda: _layout(table, patches, control_of_vertex, layouts))
+        layout = _LAYOUTS.get((table, *layouts), lambda: _layout(table, patches, layouts))
         values = {}
         for index, (name, channel) in enumerate(channels.items()):
             key, evaluate = (layout, index, Content(channel.values)), partial(layout.evaluate[index], channel)
@@ -80,9 +78,7 @@ class AttributeTable:
 _VALUES: Shared[FloatArray] = Shared()
 
 
-def _layout(
-    table: VertexTable, patches: PatchTable, control_of_vertex: IntArray, layouts: tuple[ChannelLayout, ...]
-) -> AttributeLayout:
+def _layout(table: VertexTable, patches: PatchTable, layouts: tuple[ChannelLayout, ...]) -> AttributeLayout:
     """The layout of attributes with the given channel layouts at the vertices of a tessellation."""
     # Only elements that are faces have seams. Cutting them along seams keeps their half-edges.
     grid, surface_vertex = table.grid, None
@@ -95,11 +91,14 @@ def _layout(
         surface_vertex = grid.vertices_of(table.grid)
     locate = cache(grid.locations)
 
+    def interpolated(table: VertexTable, channel: Channel) -> FloatArray:
+        control_values = np.zeros((table.control_count, channel.values.shape[1]))
+        control_values[channel.layout.patches.control_of_vertex] = channel.values[channel.layout.value_index]
+        return table.interpolated(control_values)
+
     def on_surface(channel: Channel) -> FloatArray:
         # Without seams, and subdivided on the surface's mesh.
-        control_values = np.zeros((table.control_count, channel.values.shape[1]))
-        control_values[control_of_vertex] = channel.values[channel.layout.value_index]
-        vertex_values = table.interpolated(control_values)
+        vertex_values = interpolated(table, channel)
         vertex_values[table.copies[0]] = vertex_values[table.copies[1]]
         return vertex_values if surface_vertex is None else vertex_values[surface_vertex]
 
@@ -110,7 +109,7 @@ def _layout(
             return lambda channel: channel.evaluate(*locate())
         channel_table = uniform_table(layout.patches, table.grid.rate)
         vertices = grid.vertices_of(channel_table.grid)
-        return lambda channel: channel_table.interpolated(channel.values[channel.layout.value_index])[vertices]
+        return lambda channel: interpolated(channel_table, channel)[vertices]
 
     evaluations = tuple(map(evaluate, layouts))
     if not seams:

@@ -29,7 +29,7 @@ def bytes_of_tessellation(patches: PatchTable, grid: UniformGrid) -> int:
     # A patch at a corner of an element has half the segments along each side.
     at_corner = (rate // 2 + 1) ** 2
     sample_count = 0
-    for patch_class in (patches if refined is None else refined.table).classes:
+    for patch_class in patches.evaluated.classes:
         is_whole = refined is None and patches.is_whole[patches.elements.face[patch_class.corners[:1]]][0]
         sample_count += in_whole if is_whole else at_corner
     return VERTEX_BYTES * grid.vertex_count + SAMPLE_BYTES * sample_count
