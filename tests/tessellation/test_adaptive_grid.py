@@ -10,9 +10,9 @@ from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurfac
 from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.tessellation import adaptive
+from mitsuba_subdivision.tessellation.adaptive import feature_edges
 from mitsuba_subdivision.tessellation.adaptive_grid import PatchFrames
 from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
-from mitsuba_subdivision.tessellation.tile_rates import feature_edges
 from patches.closed_cages import bumpy
 from tessellation.distances import distances_of_pairs
 from tessellation.test_attribute_table import EVERY_CAGE, with_seams

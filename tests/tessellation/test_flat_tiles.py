@@ -14,9 +14,9 @@ from mitsuba_subdivision.evaluation.patch_tree import patch_trees
 from mitsuba_subdivision.schemes import CatmullClark
 from mitsuba_subdivision.schemes.scheme import StencilTable
 from mitsuba_subdivision.surface import LimitSurface
+from mitsuba_subdivision.tessellation.adaptive import TileRates, _extent, _normals_to
 from mitsuba_subdivision.tessellation.adaptive_grid import PatchFrames, whole_patches
 from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
-from mitsuba_subdivision.tessellation.tile_rates import TileRates, _extent, _normals_to
 from scipy import sparse
 
 # Samples along each side, less one. They miss this part of an extent at most: a smooth function is lower by an eighth

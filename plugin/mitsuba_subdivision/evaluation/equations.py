@@ -70,10 +70,8 @@ def locate(domain: ParameterDomain, uv: FloatArray) -> tuple[NDArray[np.int64], 
     """
     _, exponent = np.frexp(domain.extent(uv))
     level = np.maximum(-exponent.astype(np.int64), 0)
-    magnified = np.ldexp(uv, level[:, None])
-    candidates = np.stack([child(magnified) for child in domain.children[1:]])
-    child = np.argmax(domain.inside(candidates), axis=0)
-    return level, child, candidates[child, np.arange(len(uv))]
+    number, u, v, _ = domain.child_at(*np.ldexp(uv, level[:, None]).T)
+    return level, np.maximum(number, 1) - 1, np.stack([u, v], axis=1)
 
 
 def child_rows(

@@ -113,7 +113,7 @@ class LocatedSamples:
                 break
             divide(trees[number] for number in inner)
             in_inner, begins = np.concatenate([samples[number] for number in inner]), np.cumsum(counts) - counts
-            child, child_uv = domain.first_child(uv[in_inner].T)
+            child, *child_uv, _ = domain.child_at(*uv[in_inner].T)
             is_only = np.repeat([trees[number].kind == PartKind.ONLY_CHILD for number in inner], counts)
             # Children at corners are numbered from the element's first corner; the middle of a triangle comes last.
             corners = domain.corner_count
