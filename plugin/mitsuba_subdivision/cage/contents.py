@@ -77,11 +77,10 @@ def validated_attribute(
             raise CageError(f"{label} has {len(values)} values; expected {topology.vertex_count}, one per vertex")
         return Attribute(values, interpolation)
     corner_count = topology.half_edge_count
-    if indices is None:
-        if len(values) != corner_count:
-            expected = f"expected {corner_count} values, one per face corner"
-            raise CageError(f"{label} has {len(values)} values and no indices; {expected}")
-        indices = np.arange(corner_count)
+    if indices is None and len(values) != corner_count:
+        expected = f"expected {corner_count} values, one per face corner"
+        raise CageError(f"{label} has {len(values)} values and no indices; {expected}")
+    indices = np.arange(corner_count) if indices is None else indices
     # Not copied before the length is checked, as a damaged file may have any number of indices.
     if indices.shape != (corner_count,) or not np.issubdtype(indices.dtype, np.integer):
         raise CageError(
@@ -119,7 +118,7 @@ def _validated_values(unchecked: NDArray, label: str, width: int | None) -> NDAr
 
 
 def _array(values: ArrayLike) -> NDArray:
-    """Return an array, or a zero-dimensional object array if ``values`` are none; the cage then raises an error."""
+    """An array, or a zero-dimensional object array if ``values`` are none; the cage then raises an error."""
     try:
         return np.asarray(values)
     except (TypeError, ValueError):  # Such as rows of different lengths.

@@ -310,9 +310,7 @@ class ControlCage:
             )
         cage = type(self).__new__(type(self))
         # Without what a derived class has cached.
-        names = {attribute.name for attribute in fields(self)}
-        values = {name: value for name, value in vars(self).items() if name in names}
-        vars(cage).update(values, positions=validated)
+        vars(cage).update({item.name: getattr(self, item.name) for item in fields(self)}, positions=validated)
         return cage
 
     def refined(self, scheme: str | Scheme | None = None) -> ControlCage:
@@ -489,7 +487,7 @@ class _FlatFaces(NamedTuple):
 
 
 def _attribute_properties(contents: CageContents, mi: Any) -> dict[str, Any]:
-    """Return tensors of the values and of the indices of texture coordinates and attributes."""
+    """Tensors of the values and of the indices of texture coordinates and attributes."""
     named = [
         (f"{attribute.interpolation}_{name}", f"face_varying_{name}_indices", attribute)
         for name, attribute in contents.attributes.items()

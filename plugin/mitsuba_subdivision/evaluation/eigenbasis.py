@@ -60,12 +60,10 @@ class Eigenbasis:
         return matrix
 
     def power_terms(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the first powers of T as sums of terms of rank one.
+        """Return left (K, t), right (t, K) and factors (count, t): ``T**n`` is ``left @ diag(factors[n]) @ right``.
 
-        ``T**n`` is ``left @ diag(factors[n]) @ right``. The first K terms are those of the eigenvectors. What a block
-        adds to the powers of its eigenvalue has the rank of its Jordan blocks, which are few.
-
-        Returns left (K, t), right (t, K) and factors (count, t).
+        The first K terms are those of the eigenvectors. What a block adds to the powers of its eigenvalue has the rank
+        of its Jordan blocks, which are few.
         """
         size, exponents = len(self.eigenvalues), np.arange(count)
         left: list[FloatArray] = [np.eye(size)]
@@ -77,10 +75,7 @@ class Eigenbasis:
             added: FloatArray = np.stack(powers)
             columns, sizes, _ = np.linalg.svd(added.swapaxes(0, 1).reshape(len(block), -1), full_matrices=False)
             rank = int(np.count_nonzero(sizes > DIAGONAL))
-            columns, rows = (
-                columns[:, :rank],
-                np.linalg.svd(added.reshape(-1, len(block)), full_matrices=False)[2][:rank],
-            )
+            columns, rows = columns[:, :rank], np.linalg.svd(added.reshape(-1, len(block)), False)[2][:rank]
             left.append(np.repeat(np.eye(size)[:, block_slice] @ columns, rank, axis=1))
             right.append(np.tile(rows @ np.eye(size)[block_slice], (rank, 1)))
             factors.append((columns.T @ added @ rows.T).reshape(count, -1))
@@ -157,10 +152,7 @@ def _require_basis(matrix: FloatArray, basis: Eigenbasis) -> None:
 
 
 def _clusters(eigenvalues: NDArray[np.complex128]) -> list[NDArray[np.int64]]:
-    """Return indices of equal or conjugate eigenvalues for each cluster, by decreasing modulus.
-
-    Of opposite eigenvalues the positive one comes first.
-    """
+    """Return indices of equal or conjugate eigenvalues, by decreasing modulus; of opposite ones the positive first."""
     points = eigenvalues.real + 1j * np.abs(eigenvalues.imag)
     left = np.lexsort((-points.real, -np.round(np.abs(points) / CLUSTER_WIDTH)))
     clusters = []
@@ -188,10 +180,7 @@ def _subspace(
     eigenvectors: NDArray[np.complex128],
     members: NDArray[np.int64],  # Indices of the eigenvalues of a cluster
 ) -> FloatArray:
-    """Return an orthonormal basis of the invariant subspace of a cluster of eigenvalues.
-
-    Where the eigenvectors are dependent, it is computed by block inverse iteration.
-    """
+    """Return an orthonormal basis of a cluster's invariant subspace, by block inverse iteration if need be."""
     vectors, count = eigenvectors[:, members], len(members)
     left, singular, _ = np.linalg.svd(np.hstack([vectors.real, vectors.imag]), full_matrices=False)
     block: FloatArray = left[:, :count]

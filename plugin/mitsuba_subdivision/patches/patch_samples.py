@@ -35,10 +35,7 @@ def located_runs(
     corner: IntArray,
     uv: FloatArray,  # (s, 2) float64: parameters, starting at that corner
 ) -> Iterator[tuple[IntArray, LocatedSamples, list[PatchClass]]]:
-    """Locate samples in runs sorted by class, so that a run has few classes.
-
-    Iterates over the indices of samples, their locations, and the classes that are the elements of these.
-    """
+    """Locate samples in runs of few classes: indices, locations, and the classes that are the elements of these."""
     scheme, classes = patches.scheme, patches.classes
     order = np.argsort(class_index.astype(np.min_scalar_type(len(classes))), kind="stable")
     runs = [order[part] for part in ragged.runs_of(patches.rings.vertex_counts[class_index[order]], WEIGHTS)]

@@ -18,7 +18,7 @@ from ..evaluation.patch_tree import PatchTree, patch_trees
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.one_ring import RingTable, one_rings
-from ..mesh.shared import Content, Shared
+from ..mesh.shared import Content, shared
 from ..mesh.signature import Signature, fan_codes, row_codes, signatures_at
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
@@ -31,9 +31,6 @@ if TYPE_CHECKING:
 MANY_CLASSES = 100
 FEW_PATCHES = 200
 FEWER = 4
-
-# Refinement matrices, shared by tessellations and exact shading.
-_REFINEMENTS: Shared[sparse.csr_array] = Shared()
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,18 +201,8 @@ class PatchTable:
             control_of_vertex, control_count = self.control_of_vertex, self.control_count
         refined = self.refined
         if refined is not None:
-            from scipy import sparse
-
-            def make() -> sparse.csr_array:
-                # Mesh vertices with the same control point share a column, where their weights add up, in place.
-                weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
-                columns = control_of_vertex.astype(weights.indices.dtype)[weights.indices]
-                matrix = sparse.csr_array((weights.data, columns, weights.indptr), shape=shape, copy=True)
-                matrix.sum_duplicates()
-                return matrix
-
-            key = refined, Content(control_of_vertex), control_count
-            return refined.table.controls.view(np.uint32), _REFINEMENTS.get(key, make)
+            matrix = shared(_over_control_values, refined, Content(control_of_vertex), control_count)
+            return refined.table.controls.view(np.uint32), matrix
         controls = self.controls
         if not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex))):
             controls = control_of_vertex.astype(np.int32)[controls]
@@ -257,12 +244,9 @@ class PatchTable:
         for size in np.flatnonzero(np.bincount(sizes)).tolist():
             corners.append(partial[sizes == size])
             # Codes of the fans at all corners, from the first one on, distinguish the signatures of patches.
-            columns, corner = [], corners[-1]
-            for _ in range(1 if self.scheme.element == "vertex" else size):
-                columns.append(fans[corner])
-                corner = t.next[corner]
+            around = t.around_faces(corners[-1], 1 if self.scheme.element == "vertex" else size)
             first_unused = 1 + max(int(codes_of_size.max(initial=0)) for codes_of_size in codes)
-            codes.append(row_codes(columns).astype(np.int64) + first_unused)
+            codes.append(row_codes([fans[corner] for corner in around]).astype(np.int64) + first_unused)
         return np.concatenate(corners, dtype=np.int32), np.concatenate(codes), of_mesh
 
     def _turned_to_least(
@@ -291,14 +275,24 @@ class PatchTable:
         return corners + turns, least
 
 
+def _over_control_values(refined: RefinedPatches, control_of_vertex: Content, control_count: int) -> sparse.csr_array:
+    from scipy import sparse
+
+    # Mesh vertices with the same control value share a column, where their weights add up, in place.
+    weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
+    columns = control_of_vertex.array.astype(weights.indices.dtype)[weights.indices]
+    matrix = sparse.csr_array((weights.data, columns, weights.indptr), shape=shape, copy=True)
+    matrix.sum_duplicates()
+    return matrix
+
+
 @dataclass(frozen=True, eq=False)
 class RefinedPatches:
     """Patches of a cage refined once, under a scheme that makes a quadrilateral of every face corner.
 
-    They serve cages of many classes: where polygons of many sizes meet vertices of many valences, nearly every patch
-    may be the only one of its class, and the stencils of a class take milliseconds. In the refined cage, an old vertex
-    has only new neighbours, which are of few kinds, so that few classes are left. Normals in float32 are 2 to 5 times
-    less exact, as the refined cage's vertices are rounded.
+    They serve cages where polygons of many sizes meet vertices of many valences, so that nearly every patch is a class.
+    In the refined cage, an old vertex has only new neighbours, which are of few kinds. Normals in float32 are 2 to 5
+    times less exact, as the refined cage's vertices are rounded.
     """
 
     table: PatchTable  # Of the refined cage, whose faces are all elements, and whole

@@ -17,7 +17,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
-from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -29,7 +28,7 @@ from ..evaluation.patch_tree import PartKind, PatchTree
 from ..evaluation.polynomials import polynomial_basis
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..mesh.shared import Content, Shared
+from ..mesh.shared import Content, shared
 from ..messages import counted
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
@@ -115,9 +114,7 @@ class TreeArrays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PieceTable:
-    """The pieces of all patches, and the neighbours of elements.
-
-    An element is identified by one of its half-edges, at which parameters start, as in `PatchSampler.evaluate`.
+    """The pieces of all patches, and the neighbours of elements, which are identified by one of their half-edges.
 
     *Coefficients* depend on the control points. They are the polynomials of the pieces of all patches, a number of each
     component for each monomial, padded to whole packets.
@@ -150,13 +147,11 @@ class PieceTable:
         """Prepare the evaluation of patches. Calls with equal arguments share the object while it is referenced."""
         if control_of_vertex is None:
             control_of_vertex, control_count = patches.control_of_vertex, patches.control_count
-        controls = control_of_vertex, control_count
-        key = patches, Content(control_of_vertex), control_count, piece_levels
-        return _TABLES.get(key, lambda: cls._build(patches, *controls, piece_levels))
+        return shared(cls._build, patches, Content(control_of_vertex), control_count, piece_levels)
 
     @classmethod
     def _build(
-        cls, patches: PatchTable, control_of_vertex: IntArray, control_count: int, piece_levels: int
+        cls, patches: PatchTable, control_of_vertex: Content, control_count: int, piece_levels: int
     ) -> PieceTable:
         table = patches.evaluated
         counts, elements = table.patch_counts, table.trees
@@ -191,8 +186,8 @@ class PieceTable:
             tuple(elements),
             tips,
             np.array([*zip(*columns, strict=True)], dtype=CLASS),
-            control_of_vertex,
-            patches.control_rows(control_of_vertex, control_count)[1],
+            control_of_vertex.array,
+            patches.control_rows(control_of_vertex.array, control_count)[1],
         )
 
     @property
@@ -227,9 +222,6 @@ class PieceTable:
         return columns
 
 
-_TABLES: Shared[PieceTable] = Shared()
-
-
 def piece_packets(monomial_count: int, size: int = 3) -> int:
     """Packets of the coefficients of a piece, ``size`` numbers for each monomial."""
     return -(-size * monomial_count // PACKET)
@@ -244,10 +236,12 @@ def tree_arrays(
     """Return the arrays of a patch tree."""
     scheme = element.scheme
     kinds, turns, first = element.nodes.T.copy()
-    index, end = np.zeros((2, len(first)), dtype=np.int64)
+    index, last = np.zeros((2, len(first)), dtype=np.int64)
     # Regular pieces come before those of tips.
     maps, piece_count = [], 0
-    for part, stencils in _shared_parts(element):
+    parts, rows = _shared_parts(element)
+    all_stencils = [None] if rows is None else np.split(rows, np.cumsum([part.control_count for part in parts])[:-1])
+    for part, stencils in zip(parts, all_stencils, strict=True):
         pieces = _regular_pieces(scheme, part)
         maps.append(PieceMap(piece_count, stencils, pieces))
         piece_count += len(pieces)
@@ -256,7 +250,7 @@ def tree_arrays(
     for node, piece in zip(tip_nodes[np.argsort(first[tip_nodes])].tolist(), element.tips, strict=True):
         tip, of_levels = _tip(scheme, piece.irregular_patch), _tip_pieces(scheme, piece.irregular_patch, piece_levels)
         first[node], index[node] = piece_count, len(tips)
-        end[node] = tip.frame + LEVEL * tip.level_count + TERM * len(tip.coordinates)
+        last[node] = tip.frame + LEVEL * tip.level_count + TERM * len(tip.coordinates)
         coordinates = tip.coordinates[1:] @ piece.coordinates
         # Each piece begins with the first coordinate, as the weights of a piece's constant sum to one.
         width = of_levels.shape[1] - 1
@@ -266,7 +260,7 @@ def tree_arrays(
         maps.append(PieceMap(piece_count, None, pieces))
         tips.append(tip)
         piece_count += len(pieces)
-    nodes = np.stack([kinds + TURN * turns, first, index, end], axis=1)
+    nodes = np.stack([kinds + TURN * turns, first, index, last], axis=1)
     maps = [piece_map for piece_map in maps if len(piece_map.pieces)]
     return TreeArrays(nodes, piece_count, tuple(maps), tuple(tips))
 
@@ -306,26 +300,15 @@ def _tip_pieces(scheme: Scheme, patch: IrregularPatch, piece_levels: int) -> Flo
     return by_level.reshape(by_level.shape[0] * by_level.shape[1], *by_level.shape[2:])
 
 
-def _shared_parts(element: PatchTree) -> list[tuple[PatchTree, FloatArray | None]]:
-    """Return the largest parts with at most `SHARED_PIECES` pieces, and their stencils; None for the whole element."""
+def _shared_parts(element: PatchTree) -> tuple[list[PatchTree], FloatArray | None]:
+    """Return the largest parts of at most `SHARED_PIECES` pieces, and all their stencils; None for a whole element."""
     if element.piece is not None or element.regular_count <= SHARED_PIECES:
-        return [(element, None)]
-    parts, rows = _stacked_parts(element)
-    bounds = pairwise(ragged.offsets([part.control_count for part in parts]).tolist())
-    return [(part, rows[slice(*span)]) for part, span in zip(parts, bounds, strict=True)]
-
-
-def _stacked_parts(element: PatchTree) -> tuple[list[PatchTree], FloatArray]:
-    """Return `_shared_parts` of an element that is divided, with all stencils in one array."""
+        return [element], None
     parts, rows = list[PatchTree](), []
     for child, stencils in element.children:
-        if child.piece is not None or child.regular_count <= SHARED_PIECES:
-            parts.append(child)
-            rows.append(stencils)
-        else:
-            of_child, of_parts = _stacked_parts(child)
-            parts += of_child
-            rows.append(times_matrix(of_parts[None], stencils)[0])
+        of_child, of_parts = _shared_parts(child)
+        parts += of_child
+        rows.append(stencils if of_parts is None else times_matrix(of_parts[None], stencils)[0])
     return parts, np.concatenate(rows)
 
 

@@ -77,12 +77,7 @@ def refine_cage(
     cage: ControlCage,
     chosen: str | Scheme | None,  # As for `adapted_scheme`. If not None, it becomes the refined cage's scheme.
 ) -> CageRefinement:
-    """Refine a cage once.
-
-    Raises CageError if no cage represents the refined surface, or the refined values of an attribute. Raises
-    SchemeError if the scheme does not order refined faces as Catmull-Clark, Loop or Doo-Sabin do, or does not support
-    an attribute.
-    """
+    """Refine a cage once. Raises CageError and SchemeError as `ControlCage.refinement`."""
     scheme = adapted_scheme(cage, chosen)
     contents = CageContents(
         positions=cage.positions,
@@ -96,7 +91,6 @@ def refine_cage(
 
 
 def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefinement:
-    """Refine a cage with a scheme whose elements are faces."""
     refinement = scheme.refine(cage.cut_mesh.topology)
     corners = RefinedCorners.of(cage, scheme, refinement.topology)
     matrix = _over_control_points(cage, refinement, corners.copies)
@@ -140,10 +134,7 @@ def _over_control_points(cage: ControlCage, refinement: Refinement, rows: IntArr
 def _with_tags(
     cage: ControlCage, contents: CageContents, refinement: Refinement, corners: RefinedCorners
 ) -> tuple[CageContents, ControlCage]:
-    """Add tags so that the refined cage has the refined cut mesh. Return the contents and the refined cage.
-
-    Raises CageError if there are no such tags.
-    """
+    """Add tags so that the refined cage has the refined cut mesh; return its contents, and itself."""
     expected = refinement.topology
     sharpness = _refined_sharpness(cage.tags, refinement, corners)
     stays = corners.between_corners(cage.cut_mesh.topology)
@@ -170,7 +161,6 @@ def _with_tags(
 
 
 def _refined_sharpness(tags: Sharpness, refinement: Refinement, corners: RefinedCorners) -> Sharpness:
-    """Return the sharpness of the refined cage: finite sharpness is lowered."""
     semi = refinement.topology.semi_sharpness
     edges = np.zeros(refinement.topology.half_edge_count) if semi is None else semi.edges.copy()
     # Halves of coarse edges begin or end at a coarse vertex.
@@ -182,13 +172,14 @@ def _refined_sharpness(tags: Sharpness, refinement: Refinement, corners: Refined
 
 
 def built(contents: CageContents) -> ControlCage:
-    """Build a cage without warnings, as problems that cause warnings were already in the coarse cage."""
+    """Build a cage without warnings."""
+    # Problems that cause warnings were already in the coarse cage.
     with without_warnings():
         return ControlCage.from_arrays(**contents.as_arguments())
 
 
 def _dual(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefinement:
-    """Refine a cage with Doo-Sabin, whose elements are vertices, and whose refined vertices belong to face corners."""
+    # The elements are vertices, and refined vertices belong to face corners.
     cut = cage.cut_mesh.topology.with_rules(None, None)
     refinement = scheme.refine(cut)
     t = refinement.topology
@@ -199,15 +190,8 @@ def _dual(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefi
         )
     matrix = _over_control_points(cage, refinement, np.arange(t.vertex_count))
     attributes, _ = refined_attributes(cage, scheme, refinement, matrix, None)
-    refined = built(
-        replace(
-            contents,
-            positions=matrix @ cage.positions,
-            face_sizes=t.face_sizes,
-            face_vertices=t.face_vertices,
-            **attributes,
-        )
-    )
+    contents = replace(contents, positions=matrix @ cage.positions, **attributes)
+    refined = built(replace(contents, face_sizes=t.face_sizes, face_vertices=t.face_vertices))
     element, corner = np.full((2, t.vertex_count), -1, dtype=np.int64)
     offsets, half_edges = cut.vertex_fans
     element[half_edges] = cut.face_vertices[half_edges]
@@ -219,8 +203,7 @@ def _dual(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefi
 class RefinedCorners:
     """The face corners, or half-edges, of the refined cut mesh of a cage.
 
-    The first faces are those at the coarse corners, listed from the coarse vertex on. Then come, under Loop, the middle
-    triangles, whose corners are edge points.
+    Those of the faces at the coarse corners come first, then, under Loop, those of middle triangles, at edge points.
     """
 
     cage: ControlCage
@@ -232,10 +215,7 @@ class RefinedCorners:
 
     @classmethod
     def of(cls, cage: ControlCage, scheme: Scheme, refined: Topology) -> RefinedCorners:
-        """Find the parent of each corner.
-
-        Raises SchemeError if the scheme orders refined faces differently.
-        """
+        """Find the parent of each corner. Raises SchemeError if the scheme orders refined faces differently."""
         t, cut = cage.topology, cage.cut_mesh.topology
         h = np.arange(t.half_edge_count)
         if scheme.splits_corners:
@@ -296,13 +276,10 @@ class RefinedCorners:
         self,
         indices: IntArray,  # (n_h,) int: index of the attribute's value at each face corner of the cage
     ) -> tuple[IntArray, IntArray]:
-        """Determine the distinct refined values of a face-varying attribute.
+        """Return a refined corner ``(n,)`` with each face-varying value, and the value of each corner ``(n_c,)``.
 
         Refined corners share a value if they are at the same vertex of the refined cage and depend on the same values:
         that at the coarse vertex, or those at both ends of the edge.
-
-        Returns (n,) int64, a refined corner with each value, and (n_c,) int64, the index of the value at each refined
-        corner.
         """
         t, h = self.cage.topology, self.half_edge
         start, end = h, np.where(self.kind == EDGE, t.next[h], h)
@@ -323,17 +300,13 @@ class RefinedCorners:
         return np.select([kind == VERTEX, kind == FACE], [values[h], means[t.face[h]]], along)
 
     def between_corners(self, topology: Topology) -> BoolArray:
-        """Return ``(n_c,)``: whether a corner is the edge point of a border edge between two corners of a coarse mesh.
-
-        It does not move in later refinements, like a corner.
-        """
+        """Return ``(n_c,)``: whether a corner is the point of a border edge between corners, and moves no more."""
         h, t = self.half_edge, topology
         is_corner = t.vertex_rules[t.face_vertices] == VertexRule.CORNER
         return (self.kind == EDGE) & (t.twin[h] < 0) & is_corner[h] & is_corner[t.next[h]]
 
 
 def _are_one_to_one(one: IntArray, other: IntArray) -> bool:
-    """Return whether two arrays of labels define the same partition."""
     to_other, to_one = np.zeros(one.max() + 1, dtype=np.int64), np.zeros(other.max() + 1, dtype=np.int64)
     to_other[one], to_one[other] = other, one
     return np.array_equal(to_other[one], other) and np.array_equal(to_one[other], one)
@@ -346,11 +319,9 @@ def refined_attributes(
     matrix: sparse.csr_array,  # (n, n_v) weights of the refined cage's vertices over the cage's
     corners: RefinedCorners | None,  # None under Doo-Sabin, which subdivides all values like points
 ) -> tuple[dict[str, Any], dict[str, ValueMesh]]:
-    """Refine texture coordinates and attributes.
+    """Refine texture coordinates and attributes; also returns the value meshes of attributes with seams.
 
     Raises SchemeError if the scheme does not support the interpolation of an attribute, or its seams.
-
-    Returns ``texcoords`` and ``attributes`` of the refined cage, and the value meshes of attributes with seams.
     """
     attributes: dict[str, Attribute] = {}
     value_meshes: dict[str, ValueMesh] = {}
@@ -391,8 +362,7 @@ def common_mode(
 ) -> str:
     """Return the face-varying rule for which the refined cage has the refined value meshes, if possible the cage's.
 
-    Whether face-varying values are corners depends on the seams at a vertex, and may differ in the refined cage. Then
-    it gets another rule that has the same corners. Raises CageError if there is none.
+    Another rule may have the same corners, as these depend on the seams at a vertex. Raises CageError if there is none.
     """
     problems: list[tuple[str, int]] = []
     others = [mode for mode in RULES["face_varying"] if mode not in ("all", cage.face_varying)]
@@ -421,9 +391,8 @@ def differences(
 ) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Compare two meshes, half-edge by half-edge. Meshes without differences have equal refinements.
 
-    Returns three (n_h,) bool arrays. For each half-edge of ``other``: whether it has an unexpected twin; whether its
-    origin has another `VertexRule`; and whether there is any difference, in these, or in the semi-sharpness of its edge
-    or at its origin.
+    Returns three (n_h,) bool arrays: whether a half-edge of ``other`` has an unexpected twin; whether its origin has
+    another `VertexRule`; and whether anything differs, these, or the semi-sharpness of its edge or at its origin.
     """
     has_other_twin = expected.twin != other.twin
     rules = other.vertex_rules[other.face_vertices]
@@ -455,7 +424,7 @@ def _differs_across(expected: Topology, other: Topology) -> NDArray[np.bool_]:
 def _rows_across(t: Topology) -> NDArray[np.float64]:
     """Return ``(n, 4)`` rows of `SemiSharpness` across cuts: lowest half-edge of the vertex, then the three values.
 
-    Edges that do not sharpen their vertex only contribute to averages. They are omitted at vertices without averages.
+    Edges that do not sharpen their vertex are omitted where there are no averages to which they contribute.
     """
     semi = t.semi_sharpness
     if semi is None:

@@ -261,7 +261,7 @@ class LimitSurface:
         """
         sizes = self.patches.elements.face_sizes
         chosen = np.flatnonzero(sizes) if element is None else checked_elements(self.patches, element)
-        return ElementBounds(chosen, *(side[chosen] for side in self._bounds))
+        return ElementBounds(chosen, *(side[chosen] for side in self._surface_pieces.element_bounds))
 
     def area(self) -> float:
         """Area of the surface, in squared units of the cage's space.
@@ -398,10 +398,6 @@ class LimitSurface:
     @cached_property
     def _surface_pieces(self) -> SurfacePieces:
         return SurfacePieces.build(self.patches, self.cage.positions[self.patches.control_of_vertex])
-
-    @cached_property
-    def _bounds(self) -> tuple[FloatArray, FloatArray]:
-        return self._surface_pieces.element_bounds(self.patches.elements)
 
     @cached_property
     def _areas(self) -> tuple[list[FloatArray], float]:
@@ -556,11 +552,9 @@ class LimitSurface:
         positions, normals = self.sample_vertices(table, evaluator, dtype, sample_offset)
         attributes = self.attribute_table(table)
         values = {name: attribute_values.copy() for name, attribute_values in attributes.values.items()}
-        texcoords = values.pop(TEXCOORDS, None)
-        mesh = attributes.layout
-        return Tessellation(
-            mesh.gathered(positions), mesh.gathered(normals), mesh.triangles, table.element, texcoords, values
-        )
+        mesh, texcoords = attributes.layout, values.pop(TEXCOORDS, None)
+        vertices = mesh.gathered(positions), mesh.gathered(normals)
+        return Tessellation(*vertices, mesh.triangles, table.element, texcoords, values)
 
     def tessellation_matrix(self, table: int | VertexTable = 8) -> VertexMatrices:
         """Weights of the control points at the vertices of a tessellation, as sparse matrices.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property
 from itertools import islice
 from typing import NamedTuple
 
@@ -192,7 +192,7 @@ def _divided(rates: TileRates, patches: Iterator[Part]) -> Iterator[Tiles]:
 
 
 def _taken(parts: list[Part]) -> Part:
-    """Remove about `TILES_AT_ONCE` tiles from the end of a list of parts of one kind, and return them."""
+    """Remove about `TILES_AT_ONCE` tiles from the end of a list of parts of one kind, and join them."""
     taken, count = [], 0
     while parts and count < TILES_AT_ONCE:
         taken.append(parts.pop())
@@ -220,9 +220,15 @@ class TileRates:
     criterion: Criterion
     max_rate: int  # Most segments along an edge of the cage
 
-    @property
+    @cached_property
     def basis(self) -> BernsteinBasis:
         return polynomial_basis(self.scheme).bernstein
+
+    @cached_property
+    def _of_quarters(self) -> FloatArray:
+        """``(6, b, 4, b)`` maps from coefficients to those of the four quarters and of their five derivatives."""
+        maps = np.concatenate([np.eye(len(self.basis.indices))[None], self.basis.two_derivatives])
+        return np.ascontiguousarray(np.einsum("dab,pbc->dapc", maps, self.basis.halves))
 
     @property
     def _corner_count(self) -> int:
@@ -297,10 +303,8 @@ class TileRates:
         # Tiles that fit into the limit as a whole: the only test for tiles that are folded or have no normal.
         fits = (np.linalg.norm(upper - lower, axis=0) <= limit) & self.scheme.has_convex_rules
         # Across the tile: orthogonal to both diagonals of a quadrilateral, or to two sides of a triangle.
-        axis, extent = (
-            unit(np.cross(corners[2] - corners[0], corners[-1] - corners[1], axis=0)),
-            np.full(len(tiles), np.inf),
-        )
+        axis = unit(np.cross(corners[2] - corners[0], corners[-1] - corners[1], axis=0))
+        extent = np.full(len(tiles), np.inf)
         is_flat, has_axis = fits.copy(), axis.any(axis=0)
         for hull in kind.hulls:
             tested = np.flatnonzero(~is_flat & has_axis)
@@ -327,7 +331,7 @@ class TileRates:
     def _rates(self, coefficients: FloatArray, heights: FloatArray | None) -> IntArray:
         """``(t, 2)`` rates of pieces that the limit needs, which may exceed `most`, from bounds of their quarters."""
         b, _, count = coefficients.shape
-        points, *derivatives = times(_of_quarters(self.basis).reshape(-1, b), coefficients).reshape(6, b, 4, 3, count)
+        points, *derivatives = times(self._of_quarters.reshape(-1, b), coefficients).reshape(6, b, 4, 3, count)
         # For the same limit, a quarter of half the size needs half as many segments: its form is a fourth.
         forms = 4 * self.criterion.form(points, derivatives, self._corner_count).swapaxes(0, 1)
         if heights is not None:
@@ -349,10 +353,7 @@ class TileRates:
         return sides
 
     def _heights(self, tiles: Tiles) -> FloatArray | None:
-        """``(n, n, t)`` heights of the displacement over tiles, by v and by u; None without a displacement.
-
-        Heights outside triangular tiles are not numbers.
-        """
+        """``(n, n, t)`` heights of the displacement over tiles, if any, by v and by u; NaN outside of triangles."""
         displacement = self.criterion.displacement
         if displacement is None:
             return None
@@ -376,10 +377,7 @@ def _extent(hull: FloatArray | None, values: FloatArray, axes: Iterable[FloatArr
 
 
 def _normals(kind: DividedTile, values: FloatArray, axis: FloatArray) -> Cone:
-    """Cones about axes ``(3, t)`` that contain all normals of tiles; of sine 1 where the angle is not below 90 degrees.
-
-    The pieces of the kind bound normals nearer to an extraordinary point as well, which vary less.
-    """
+    """Cones about axes ``(3, t)`` that contain all normals of tiles; of sine 1 where they are not within 90 degrees."""
     if kind.tangents is None or not len(axis.T):
         return Cone(axis, np.ones(axis.shape[1]))
     shape = kind.tangents.shape
@@ -389,10 +387,7 @@ def _normals(kind: DividedTile, values: FloatArray, axis: FloatArray) -> Cone:
 
 
 def _are_folded(kind: DividedTile, ring: FloatArray, axis: FloatArray) -> NDArray[np.bool_]:
-    """``(t,)`` whether control faces of one-rings ``(n, 3, t)`` face opposite ways along the axes; true for pieces.
-
-    A folded surface has silhouettes along its folds, and not only along edges of the cage.
-    """
+    """``(t,)`` whether control faces of one-rings ``(n, 3, t)`` face opposite ways along the axes; true for pieces."""
     if kind.is_piece:
         return np.ones(axis.shape[1], dtype=bool)
     (a, c, b, d), (x, y) = kind.control_faces, (dot(ring, along) for along in _normals_to(axis))
@@ -410,13 +405,6 @@ def _normals_to(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
     return first, np.cross(direction, first, axis=0)
 
 
-@lru_cache(maxsize=16)
-def _of_quarters(basis: BernsteinBasis) -> FloatArray:
-    """``(6, b, 4, b)`` maps from coefficients to those of the four quarters and of their five derivatives."""
-    maps = np.concatenate([np.eye(len(basis.indices))[None], basis.two_derivatives])
-    return np.ascontiguousarray(np.einsum("dab,pbc->dapc", maps, basis.halves))
-
-
 def feature_edges(
     patches: PatchTable,
     frames: PatchFrames,
@@ -425,7 +413,7 @@ def feature_edges(
 ) -> NDArray[np.bool_]:
     """``(n_h,)`` whether the curve along each half-edge must itself hold to the limit.
 
-    These are folds and, for outlines, open borders: a flat surface may end there along a curve. Along other edges, the
+    These are folds and, for outlines, open borders, where a flat surface may end along a curve. Along other edges, the
     adjacent surfaces keep the curve within the limit, unless they may be coarse.
     """
     t, names = frames.topology, frames.edge

@@ -74,10 +74,7 @@ def exceeded_limit(needed: float) -> int | None:
 def available_memory(
     root: str | Path = "/",  # Parent of the folders `proc` and `sys`
 ) -> int | None:
-    """Bytes that the process can still allocate: the least of the machine's, its control groups' and its own limit.
-
-    None if the system does not report it.
-    """
+    """Bytes that the machine, the process's control groups and its own limit leave; None if the system says nothing."""
     from pathlib import Path
 
     root = Path(root)
@@ -87,7 +84,7 @@ def available_memory(
 
 
 def _of_groups(root: Path) -> Iterator[int]:
-    """Memory left within the limit of each control group of the process, and of its ancestors."""
+    """Memory left within the limits of the process's control groups, and of their ancestors."""
     for line in _lines(root / "proc/self/cgroup"):
         _, controllers, path = line.split(":", 2)
         if controllers == "":

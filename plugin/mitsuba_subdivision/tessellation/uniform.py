@@ -10,7 +10,7 @@ import numpy as np
 
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..mesh.shared import Shared
+from ..mesh.shared import shared
 from ..patches.patch_table import PatchClass, PatchTable
 from ..schemes.domain import FloatArray
 from .memory import require_memory
@@ -27,24 +27,20 @@ def uniform_table(patches: PatchTable, rate: int) -> VertexTable:
     Raises ValueError if the rate is no integer, below 1, or so high that there are more than MOST_VERTICES vertices.
     Raises MemoryError if the tessellation would not fit into memory.
     """
-    checked = checked_rate(rate)
-
-    def make() -> VertexTable:
-        grid = UniformGrid(patches.scheme.domain, patches.elements, checked)
-        if grid.vertex_count > MOST_VERTICES:
-            raise ValueError(
-                f"tessellation rate {checked} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, "
-                "whose triangles fit into a buffer"
-            )
-        require_memory(patches, grid)
-        polynomials, (controls, refinement) = _polynomials(patches, grid), patches.control_rows()
-        counts = patches.control_count, patches.patch_count
-        return VertexTable(*counts, grid, polynomials, controls, _copies(patches, grid), refinement)
-
-    return _TABLES.get((patches, checked), make)
+    return shared(_table, patches, checked_rate(rate))
 
 
-_TABLES: Shared[VertexTable] = Shared()
+def _table(patches: PatchTable, rate: int) -> VertexTable:
+    grid = UniformGrid(patches.scheme.domain, patches.elements, rate)
+    if grid.vertex_count > MOST_VERTICES:
+        raise ValueError(
+            f"tessellation rate {rate} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, whose "
+            "triangles fit into a buffer"
+        )
+    require_memory(patches, grid)
+    polynomials, (controls, refinement) = _polynomials(patches, grid), patches.control_rows()
+    counts = patches.control_count, patches.patch_count
+    return VertexTable(*counts, grid, polynomials, controls, _copies(patches, grid), refinement)
 
 
 def checked_rate(rate: int, name: str = "tessellation rate") -> int:
@@ -86,7 +82,7 @@ def _polynomials(patches: PatchTable, grid: UniformGrid) -> tuple[VertexPolynomi
 
 
 def _layouts(patches: PatchTable, grid: UniformGrid) -> Iterator[tuple[list[PatchClass], FloatArray, list[GridPart]]]:
-    """Iterate over the classes of whole elements and those of elements' corners, with their `UniformGrid.layout`."""
+    """The classes of whole elements, and those of elements' corners, with their `UniformGrid.layout`."""
     by_wholeness: dict[bool, list[tuple[PatchClass, IntArray]]] = {True: [], False: []}
     for patch_class in patches.evaluated.classes:
         corners = patches.places(patch_class)
@@ -101,10 +97,7 @@ def _layouts(patches: PatchTable, grid: UniformGrid) -> Iterator[tuple[list[Patc
 
 
 def _copies(patches: PatchTable, grid: UniformGrid) -> IntArray:
-    """`VertexTable.copies` at the corners of elements, then inside edges.
-
-    The border of the mesh consists of the boundary of the cage and the sides of its creases.
-    """
+    """`VertexTable.copies` on the boundary of the cage and the sides of its creases: at corners, then inside edges."""
     t, control_of_vertex = patches.elements, patches.control_of_vertex
     border = np.flatnonzero(t.twin < 0)
     if patches.scheme.element == "vertex" or not len(border):
