@@ -50,8 +50,9 @@ class Attribute:
     def __init__(
         self, values: ArrayLike, interpolation: Interpolation = "vertex", indices: ArrayLike | None = None
     ) -> None:
-        indices = None if indices is None else _array(indices)
-        vars(self).update(values=_array(values), interpolation=interpolation, indices=indices)
+        object.__setattr__(self, "values", _array(values))
+        object.__setattr__(self, "interpolation", interpolation)
+        object.__setattr__(self, "indices", None if indices is None else _array(indices))
 
 
 def validated_attribute(
@@ -129,11 +130,7 @@ def _array(values: ArrayLike) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class CageContents:
-    """Contents of a file with a control cage, not yet validated.
-
-    Readers of files return it, and `ControlCage.from_arrays` validates it. Writers of files take the contents of a
-    cage, `ControlCage.contents`.
-    """
+    """Contents of a file with a control cage, not yet validated: readers return them, writers take them."""
 
     positions: NDArray  # (n_v, 3)
     face_sizes: IntArray  # (n_f,) int: number of vertices of each face

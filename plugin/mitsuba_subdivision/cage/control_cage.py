@@ -185,24 +185,25 @@ class ControlCage:
             **rules,
         ).shared()
         topology = structure.topology
-        vars(self).update(
-            positions=validated,
-            structure=structure,
-            texcoords=(
-                None if texcoords is None else validated_attribute(texcoords, "texcoords", topology, source, order, 2)
-            ),
-            attributes={
-                name: validated_attribute(attribute, name, topology, source, order)
-                for name, attribute in attributes.items()
-            },
-            materials={
+
+        def checked(given: Attribute | ArrayLike, name: str, width: int | None = None) -> Attribute:
+            return validated_attribute(given, name, topology, source, order, width)
+
+        values = {
+            "positions": validated,
+            "structure": structure,
+            **{item.name: getattr(structure, item.name) for item in fields(structure)},
+            "texcoords": None if texcoords is None else checked(texcoords, "texcoords", 2),
+            "attributes": {name: checked(attribute, name) for name, attribute in attributes.items()},
+            "materials": {
                 name: validated_face_indices(topology, faces, "material face", source)
                 for name, faces in (materials or {}).items()
             },
-            scheme=scheme,
-            source=source,
-            **{attribute.name: getattr(structure, attribute.name) for attribute in fields(structure)},
-        )
+            "scheme": scheme,
+            "source": source,
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
 
     @classmethod
     def from_arrays(

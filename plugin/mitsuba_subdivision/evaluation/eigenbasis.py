@@ -94,11 +94,7 @@ class Eigenbasis:
 def eigenbasis(
     matrix: FloatArray,  # (K, K) float64: rows sum to one, 1 is a simple eigenvalue, and all others are smaller
 ) -> Eigenbasis:
-    """Compute the eigenbasis of a subdivision matrix.
-
-    ``numpy.linalg.eig`` alone is not enough, see section 6 of plugin/MATHEMATICS.md. So close eigenvalues are grouped
-    into clusters. The basis consists of an orthonormal basis of each cluster's invariant subspace, computed by inverse
-    iteration where the eigenvectors are dependent. In this basis the matrix is block-diagonal.
+    """Compute the eigenbasis of a subdivision matrix, by section 6 of plugin/MATHEMATICS.md.
 
     Raises EigenbasisError if the second eigenvalue is not below one, distinct eigenvalues are too close to separate
     their vectors, or one of ``A V = V T``, ``L V = 1`` and ``A^20 = V T^20 L`` does not hold to 1e-10.

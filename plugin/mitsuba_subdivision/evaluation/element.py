@@ -158,10 +158,8 @@ def derivative_stencils(located: LocatedSamples, derivatives: int) -> list[Float
 
 def _times_points(weights: list[FloatArray], points: list[FloatArray]) -> FloatArray:
     """Return ``(d, x, s)``: for each element, weights ``(m, d, K)`` times control points ``(m, K, x)`` of samples."""
-    return np.concatenate(
-        [(w.astype(p.dtype, copy=False) @ p).transpose(1, 2, 0) for w, p in zip(weights, points, strict=True)],
-        axis=2,
-    )
+    pairs = zip(weights, points, strict=True)
+    return np.concatenate([(w.astype(p.dtype, copy=False) @ p).transpose(1, 2, 0) for w, p in pairs], axis=2)
 
 
 def _chosen(points: list[FloatArray], located: LocatedSamples, which: IntArray) -> list[FloatArray]:

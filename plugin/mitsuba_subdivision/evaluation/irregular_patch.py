@@ -60,10 +60,7 @@ class IrregularPatch:
 
     @cached_property
     def basis(self) -> Eigenbasis:
-        """Eigenbasis of A, oriented so that the characteristic map preserves the orientation of the parameters.
-
-        Raises SchemeError if the rules do not contract the one-ring to a point.
-        """
+        """Eigenbasis of A, with a positive f of (13). Raises SchemeError if the rules do not contract the one-ring."""
         try:
             basis = eigenbasis(self.matrix)
         except EigenbasisError as error:

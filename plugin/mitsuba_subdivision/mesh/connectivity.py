@@ -63,7 +63,7 @@ class SemiSharpness:
     ) -> SemiSharpness | None:
         """Return the sharpness including that after the next refinement; None if nothing is sharp.
 
-        Section 11 of plugin/MATHEMATICS.md has the decay.
+        Section 11 of plugin/MATHEMATICS.md has the decay [DeRose et al. 1998].
         """
         if not (edges.any() or vertices.any() or across_sharpness.any()):
             return None

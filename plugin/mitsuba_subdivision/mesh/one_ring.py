@@ -302,11 +302,8 @@ def joined_rings(signatures: Sequence[Signature]) -> tuple[Topology, IntArray, I
     """
     rings = one_rings(signatures)
     parts = [ring.topology for ring in rings]
-    half_edges, vertices = (
-        ragged.offsets(counts)
-        for counts in ([part.half_edge_count for part in parts], [part.vertex_count for part in parts])
-    )
-    counts = np.diff(half_edges)
+    counts = [part.half_edge_count for part in parts]
+    half_edges, vertices = ragged.offsets(counts), ragged.offsets([part.vertex_count for part in parts])
     topology = Topology(
         int(vertices[-1]),
         np.concatenate([part.face_sizes for part in parts]),

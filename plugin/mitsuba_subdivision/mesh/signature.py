@@ -69,9 +69,8 @@ class Fan(NamedTuple):
     def near(self) -> Fan:
         """Return the fan without faces whose influence on the first face is negligible.
 
-        The vertex of an open fan depends on its two border neighbours only. A face influences only its neighbours at
-        each refinement, with a small weight. So a large fan is reduced to the `NEAR_FACES` around the first face; its
-        outermost neighbours remain those on the borders (`OneRing.open_fans`).
+        A large open fan is reduced to the `NEAR_FACES` around the first face, see section 6 of plugin/MATHEMATICS.md;
+        its outermost neighbours remain those on the borders (`OneRing.open_fans`).
         """
         # At a dart, faces on both sides of its crease interact.
         is_dart = self.rule == VertexRule.DART

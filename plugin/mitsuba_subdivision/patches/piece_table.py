@@ -3,13 +3,9 @@
 The samples of a kernel are unknown before it runs. So elements are divided completely (`patch_trees`). Each node is an
 inner node, with four children or one; a regular piece; or a tip, the patch around an extraordinary point.
 
-A regular piece is a polynomial, whose coefficients are weights times the control points of the element's one-ring. So
-is each of the three regular children at the first levels of a tip. These coefficients are computed once for the control
-points, and suffice for nearly all samples: after three levels a 64th of a tip's domain is left.
-
-Deeper levels are sums by equations (10) and (12). Their terms are polynomials that all levels and all tips of a kind
-share, times a factor for each level, times eigen-coordinates of the tip, which are computed as its pieces are. The
-first eigenvector, which is constant, contributes only to the point itself.
+Regular pieces, and the three regular children at the first levels of a tip, are polynomials, whose coefficients are
+computed once for the control points, and suffice for nearly all samples. Deeper levels are sums by equations (10) and
+(12): section 7 of plugin/MATHEMATICS.md. The first eigenvector, which is constant, contributes only to the point.
 """
 
 from __future__ import annotations
@@ -31,7 +27,6 @@ from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, shared
 from ..messages import counted
 from ..schemes.domain import FloatArray
-from ..schemes.scheme import Scheme
 from .patch_table import PatchTable
 
 if TYPE_CHECKING:
@@ -234,7 +229,6 @@ def tree_arrays(
     piece_levels: int = PIECE_LEVELS,  # Number of levels of a tip that are pieces; the others are summed
 ) -> TreeArrays:
     """Return the arrays of a patch tree."""
-    scheme = element.scheme
     kinds, turns, first = element.nodes.T.copy()
     index, last = np.zeros((2, len(first)), dtype=np.int64)
     # Regular pieces come before those of tips.
@@ -242,13 +236,13 @@ def tree_arrays(
     parts, rows = _shared_parts(element)
     all_stencils = [None] if rows is None else np.split(rows, np.cumsum([part.control_count for part in parts])[:-1])
     for part, stencils in zip(parts, all_stencils, strict=True):
-        pieces = _regular_pieces(scheme, part)
+        pieces = _regular_pieces(part)
         maps.append(PieceMap(piece_count, stencils, pieces))
         piece_count += len(pieces)
     # In nodes of tips, `first` is the index in `PatchTree.tips`.
     tip_nodes, tips = np.flatnonzero(kinds == PartKind.TIP), list[Tip]()
     for node, piece in zip(tip_nodes[np.argsort(first[tip_nodes])].tolist(), element.tips, strict=True):
-        tip, of_levels = _tip(scheme, piece.irregular_patch), _tip_pieces(scheme, piece.irregular_patch, piece_levels)
+        tip, of_levels = _tip(piece.irregular_patch, piece_levels)
         first[node], index[node] = piece_count, len(tips)
         last[node] = tip.frame + LEVEL * tip.level_count + TERM * len(tip.coordinates)
         coordinates = tip.coordinates[1:] @ piece.coordinates
@@ -266,9 +260,9 @@ def tree_arrays(
 
 
 @lru_cache(maxsize=1024)
-def _tip(scheme: Scheme, patch: IrregularPatch) -> Tip:
-    """Return the terms of a tip."""
-    basis, polynomials, level_count = patch.basis, polynomial_basis(scheme), float32_levels(patch)
+def _tip(patch: IrregularPatch, piece_levels: int) -> tuple[Tip, FloatArray]:
+    """Return the terms of a tip, and polynomials ``(n, m, K)`` of its first levels over the eigen-coordinates."""
+    basis, polynomials, level_count = patch.basis, polynomial_basis(patch.scheme), float32_levels(patch)
     left, coordinates, factors = basis.power_terms(level_count)
     term_count = len(coordinates)
     blocks: FloatArray = np.zeros((FACTORS, term_count, len(polynomials.powers)))
@@ -279,7 +273,7 @@ def _tip(scheme: Scheme, patch: IrregularPatch) -> Tip:
     rest[:, [u, v]] = basis.subdominant**level_count * patch.edge_tangents.T
     frame[:, [u, v]] = patch.limit_frame.T
     # Polynomials are about the middle of the domain, and the extraordinary point is at its corner.
-    rest[:, 0] = rest[:, [u, v]] @ scheme.domain.centre
+    rest[:, 0] = rest[:, [u, v]] @ patch.scheme.domain.centre
     rest_factors, tables = np.ones((1, term_count)), [factors]
     if patch.contracts_unevenly:
         across = factors / basis.moduli[2] ** np.arange(level_count)[:, None]
@@ -290,14 +284,9 @@ def _tip(scheme: Scheme, patch: IrregularPatch) -> Tip:
     rows = np.pad(blocks.reshape(-1, blocks.shape[2]), ((0, 0), (0, size - blocks.shape[2])))
     rows = np.concatenate([rows, np.pad(values, (0, -len(values) % size)).reshape(-1, size)])
     kind = FrameKind.AT_POINT if patch.has_own_frame else FrameKind.DERIVATIVES
-    return Tip(rows, coordinates, FrameKind.UNEVEN if patch.contracts_unevenly else kind, level_count)
-
-
-@lru_cache(maxsize=1024)
-def _tip_pieces(scheme: Scheme, patch: IrregularPatch, piece_levels: int) -> FloatArray:
-    """Return the polynomials of the first levels of a tip over the eigen-coordinates, ``(n, m, K)``."""
-    by_level = level_polynomials(patch, polynomial_basis(scheme).matrix, np.arange(piece_levels))
-    return by_level.reshape(by_level.shape[0] * by_level.shape[1], *by_level.shape[2:])
+    pieces = level_polynomials(patch, polynomials.matrix, np.arange(piece_levels))
+    tip = Tip(rows, coordinates, FrameKind.UNEVEN if patch.contracts_unevenly else kind, level_count)
+    return tip, pieces.reshape(LEVEL_PIECES * piece_levels, *pieces.shape[2:])
 
 
 def _shared_parts(element: PatchTree) -> tuple[list[PatchTree], FloatArray | None]:
@@ -313,6 +302,6 @@ def _shared_parts(element: PatchTree) -> tuple[list[PatchTree], FloatArray | Non
 
 
 @lru_cache(maxsize=1024)
-def _regular_pieces(scheme: Scheme, element: PatchTree) -> FloatArray:
+def _regular_pieces(element: PatchTree) -> FloatArray:
     """Return ``(p, m, K)`` coefficients of an element's regular pieces."""
-    return element.coefficients(polynomial_basis(scheme).matrix)
+    return element.coefficients(polynomial_basis(element.scheme).matrix)

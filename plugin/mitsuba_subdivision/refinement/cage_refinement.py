@@ -79,14 +79,8 @@ def refine_cage(
 ) -> CageRefinement:
     """Refine a cage once. Raises CageError and SchemeError as `ControlCage.refinement`."""
     scheme = adapted_scheme(cage, chosen)
-    contents = CageContents(
-        positions=cage.positions,
-        face_sizes=cage.face_sizes,
-        face_vertices=cage.face_vertices,
-        rules={name: getattr(cage, name) for name in RULES},
-        scheme=cage.scheme if chosen is None else scheme.name,
-        source=CageSource(f"{cage.source.name}, refined"),
-    )
+    named, source = cage.scheme if chosen is None else scheme.name, CageSource(f"{cage.source.name}, refined")
+    contents = replace(cage.contents, texcoords=None, attributes={}, materials={}, scheme=named, source=source)
     return (_dual if scheme.element == "vertex" else _primal)(cage, scheme, contents)
 
 
@@ -300,7 +294,7 @@ class RefinedCorners:
         return np.select([kind == VERTEX, kind == FACE], [values[h], means[t.face[h]]], along)
 
     def between_corners(self, topology: Topology) -> BoolArray:
-        """Return ``(n_c,)``: whether a corner is the point of a border edge between corners, and moves no more."""
+        """Return ``(n_c,)``: whether a corner is the point of a border edge between corners, which moves no more."""
         h, t = self.half_edge, topology
         is_corner = t.vertex_rules[t.face_vertices] == VertexRule.CORNER
         return (self.kind == EDGE) & (t.twin[h] < 0) & is_corner[h] & is_corner[t.next[h]]

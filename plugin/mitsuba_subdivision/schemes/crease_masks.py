@@ -80,15 +80,15 @@ def crease_masks(
 
 def kept_sharpness(
     topology: Topology,
-    # (n_h',) int: `Topology.face_vertices` of the refined mesh. The faces at coarse corners come first, each listed
-    # from the coarse vertex on.
-    face_vertices: NDArray[np.integer],
-    # Index of the last edge in each of these faces. The first and the last edge are halves of coarse edges.
-    last: int,
+    face_vertices: NDArray[np.integer],  # (n_h',) int: `Topology.face_vertices` of the refined mesh
+    last: int,  # Index of the last edge in each of the faces at coarse corners
     new_count: int,  # Number of appended vertices
     method: CreaseMethod,
 ) -> SemiSharpness | None:
-    """Return the semi-sharp features after a refinement that keeps the vertices and creates a face at every corner."""
+    """Return the semi-sharp features after a refinement that keeps the vertices and creates a face at every corner.
+
+    These faces come first, from the coarse vertex on. Their first and last edges are halves of coarse ones.
+    """
     semi, t = topology.semi_sharpness, topology
     if semi is None:
         return None

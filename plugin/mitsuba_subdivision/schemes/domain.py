@@ -40,9 +40,7 @@ class ParameterMap(NamedTuple):
 
     def is_same(self, other: ParameterMap) -> bool:
         """Return whether two maps are exactly equal."""
-        if self is other:
-            return True
-        return np.array_equal(self.matrix, other.matrix) and np.array_equal(self.offset, other.offset)
+        return self is other or all(map(np.array_equal, self, other))
 
 
 IDENTITY = ParameterMap(np.eye(2), np.zeros(2))

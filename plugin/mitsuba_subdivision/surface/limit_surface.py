@@ -87,7 +87,8 @@ class LimitSurface:
     def __init__(self, cage: ControlCage, scheme: str | Scheme | None = None) -> None:
         if not isinstance(cage, ControlCage):
             raise CageError(f"cage {cage!r}; expected a ControlCage")
-        vars(self).update(cage=cage, scheme=adapted_scheme(cage, scheme))
+        object.__setattr__(self, "cage", cage)
+        object.__setattr__(self, "scheme", adapted_scheme(cage, scheme))
 
     def __reduce__(self) -> tuple[type[LimitSurface], tuple[ControlCage, Scheme]]:
         # The cached sampler holds locks, which cannot be pickled. A copy prepares its own.

@@ -84,9 +84,17 @@ def adaptive_table(
     max_rate = checked_rate(max_rate, "max_rate")
     if max_rate > HIGHEST_RATE:
         raise ValueError(f"max_rate {max_rate}; expected at most {HIGHEST_RATE} segments per edge")
-    frames = PatchFrames.of(patches)
+    frames, points = PatchFrames.of(patches), control_points[patches.control_of_vertex]
     rates = TileRates(patches.scheme, frames, criterion, max_rate)
-    grid = AdaptiveGrid.of(_chosen(patches, rates, control_points[patches.control_of_vertex], cage_name), frames)
+    none = np.empty(0, dtype=tile_type(patches.scheme.domain.corner_count))
+    needed = np.concatenate([none, *_divided(rates, _whole_patches(patches, rates, points))])
+    u, v = needed["origin"].T
+    needed = needed[np.lexsort((needed["is_flipped"], u, v, needed["depth"], needed["corner"]))]
+    tiles, most = needed.copy(), rates.most(needed)[:, None]
+    tiles["rates"], tiles["sides"] = np.minimum(needed["rates"], most), np.minimum(needed["sides"], most)
+    if criterion.outline is None:
+        _warn_of_coarse(patches, needed, tiles, max_rate, cage_name)
+    grid = AdaptiveGrid.of(tiles, frames)
     polynomials, (controls, refinement) = _polynomials(patches, grid), patches.control_rows()
     counts = patches.control_count, patches.patch_count
     return VertexTable(*counts, grid, polynomials, controls, grid.copies(), refinement)
@@ -106,24 +114,6 @@ def _polynomials(patches: PatchTable, grid: AdaptiveGrid) -> tuple[VertexPolynom
     samples, ones = ragged.index_in_row(counts), np.ones_like(distinct)
     runs = VertexRuns(patch_class[distinct], ones, samples, 0 * ones, kind, patch[order], order)
     return vertex_polynomials(table.scheme, table.classes, uv_of_class, runs)
-
-
-def _chosen(
-    patches: PatchTable,
-    rates: TileRates,
-    points: FloatArray,  # (n_v, 3) float64: at the vertices of the mesh
-    cage_name: str,
-) -> Tiles:
-    """Divide the patches of a cage into tiles, in the order of the elements, and choose their rates."""
-    none = np.empty(0, dtype=tile_type(patches.scheme.domain.corner_count))
-    needed = np.concatenate([none, *_divided(rates, _whole_patches(patches, rates, points))])
-    u, v = needed["origin"].T
-    needed = needed[np.lexsort((needed["is_flipped"], u, v, needed["depth"], needed["corner"]))]
-    tiles, most = needed.copy(), rates.most(needed)[:, None]
-    tiles["rates"], tiles["sides"] = np.minimum(needed["rates"], most), np.minimum(needed["sides"], most)
-    if rates.criterion.outline is None:
-        _warn_of_coarse(patches, needed, tiles, rates.max_rate, cage_name)
-    return tiles
 
 
 def _warn_of_coarse(patches: PatchTable, needed: Tiles, tiles: Tiles, max_rate: int, cage_name: str) -> None:

@@ -139,7 +139,6 @@ class Sides(NamedTuple):
 
     def at_vertices(self, corner_count: int) -> IndexArray:
         """``(t, m)`` half-edge that begins at the element's vertex at each corner of tiles; -1 at other corners."""
-        # There, two successive sides lie on edges.
         half_edge = self.half_edge.reshape(-1, corner_count)
         return np.where(np.roll(half_edge, 1, axis=1) >= 0, half_edge, -1)
 

@@ -60,8 +60,6 @@ class UniformGrid:
         # Steps from a corner of a polygon to samples inside its grid: for an even rate, the last one is on a spoke.
         self._inside = np.arange(1, self._half + self._is_odd)
 
-    # Numbers of vertices
-
     @cached_property
     def vertex_count(self) -> int:
         return self.inner_begin + int(self._inner_counts.sum())
@@ -155,8 +153,6 @@ class UniformGrid:
         t, face, n = self.topology, self.topology.face[corners], len(self._inside)
         return self.inner_start[face] + 1 + t.face_sizes[face] * n**2 + (corners - t.face_offsets[face]) * n
 
-    # Samples of whole elements
-
     @cached_property
     def _steps(self) -> IntArray:
         """``(S, 2)`` grid indices along u and v of the samples of a whole element, u fastest."""
@@ -179,8 +175,6 @@ class UniformGrid:
         ends = zip(self.domain.corners, np.roll(self.domain.corners, -1, axis=0), strict=True)
         along = np.arange(self.rate + 1)[:, None]
         return [self._sample_at(self.rate * begin + along * (end - begin)) for begin, end in ends]
-
-    # Triangles
 
     @cached_property
     def triangle_counts(self) -> IntArray:
@@ -258,8 +252,6 @@ class UniformGrid:
         # `repeat` is faster with a scalar.
         repeats = counts[0] if (counts == counts[0]).all() else counts
         return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), repeats)
-
-    # Grids of patches
 
     def layout(self, corners: IntArray, *, are_corners: bool = False) -> tuple[FloatArray, list[GridPart]]:
         """The grids of the patches that begin at ``corners``, which are all in whole elements or all not.
@@ -346,8 +338,6 @@ class UniformGrid:
                 half_edge[vertices] = part.corners[:, None]
                 uv[vertices] = part.uv
         return half_edge, uv
-
-    # Other grids
 
     def cut(self, topology: Topology) -> UniformGrid:
         """The same triangles over elements cut along more edges, where vertices have a copy on each side."""

@@ -105,11 +105,9 @@ class VertexTable:
 class VertexPolynomials:
     """Vertices on polynomials with the same monomials.
 
-    A *block* is a matrix of weights. Times the control points of a patch, it gives the coefficients of a polynomial.
-    There is a polynomial for each block, and each patch of the block's class that has vertices on it.
-
-    A run has vertices on one polynomial. All runs of a kind have vertices at the same parameters. An entry is one
-    vertex of a kind.
+    A *block* is a matrix of weights. Times the control points of a patch of its class, it gives the coefficients of a
+    polynomial. A run has vertices on one polynomial. All runs of a kind have vertices at the same parameters. An entry
+    is one vertex of a kind.
     """
 
     powers: IntArray  # (m, 2) int64: exponents of the monomials in parameters from the middle of the domain
