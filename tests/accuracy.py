@@ -18,7 +18,7 @@ from evaluation.common import BARS, largest_errors
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.evaluation import element, irregular_patch, patch_tree
 from mitsuba_subdivision.mesh import one_ring
-from mitsuba_subdivision.mesh.signature import signature_at
+from mitsuba_subdivision.mesh.signature import signatures_at
 from reference import bars
 from reference.exact_samples import SCHEMES, ExactSamples, angle, samples_at
 
@@ -32,8 +32,8 @@ COLUMNS = {**BARS, "point f32": bars.POINT_FLOAT32, "normal f32": bars.NORMAL_FL
 
 def build_time(surface: LimitSurface) -> float:
     """Milliseconds to prepare the class of element 0 from nothing, its pieces and eigenbasis; the best of three."""
-    half_edge = surface.patches.half_edge_of_corner[0]
-    signature = signature_at(surface.cage.topology, int(half_edge), surface.scheme.element)
+    half_edges = surface.patches.half_edge_of_corner[:1]
+    (signature,) = signatures_at(surface.cage.topology, half_edges, surface.scheme.element)
     times = []
     for _ in range(3):
         for module in (one_ring, patch_tree, element, irregular_patch):

@@ -72,7 +72,7 @@ def patch_of(scheme, valence):
 
 def classes(surface):
     """The scheme and the signatures of its patches, or those of the refined cage if it is refined first."""
-    table = surface.patches if surface.patches.refined is None else surface.patches.refined.table
+    table = surface.patches.evaluated
     return table.scheme, [patch_class.signature for patch_class in table.classes]
 
 

@@ -6,7 +6,7 @@ from mitsuba_subdivision import ControlCage
 from mitsuba_subdivision.cage import CageError
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.mesh.connectivity import paired
-from mitsuba_subdivision.refinement.refined_corners import differences
+from mitsuba_subdivision.refinement.cage_refinement import differences
 from patches.closed_cages import torus
 from reference.exact_samples import mesh_of
 

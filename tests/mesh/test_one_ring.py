@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.mesh import ragged
 from mitsuba_subdivision.mesh.one_ring import RingTable, one_ring
-from mitsuba_subdivision.mesh.signature import Fan, Signature, signature_at
+from mitsuba_subdivision.mesh.signature import Fan, Signature, signatures_at
 from patches.closed_cages import CLOSED_CAGES, cube_with_valence_2, polygons, torus
 from reference.exact_samples import mesh_of
 from reference.refined_cages import sheet, tagged
@@ -12,6 +12,10 @@ pytestmark = pytest.mark.core
 # Two polygons back to back: every vertex has valence 2, and the faces share all their edges.
 PILLOWS = {f"pillow {n}": mesh_of(n, [range(n), range(n - 1, -1, -1)]) for n in (3, 4, 5)}
 TOPOLOGIES = {name: make().topology for name, make in CLOSED_CAGES.items()} | PILLOWS
+
+
+def signature_at(topology, half_edge, kind):
+    return signatures_at(topology, np.array([half_edge]), kind)[0]
 
 
 def half_edges_of(topology, most=80):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.mesh.one_ring import RingTable, one_ring
-from mitsuba_subdivision.mesh.signature import FEW_CODES, NEAR_FACES, row_codes, signature_at
+from mitsuba_subdivision.mesh.signature import FEW_CODES, NEAR_FACES, row_codes, signatures_at
 from mitsuba_subdivision.patches.patch_table import PatchTable
 from mitsuba_subdivision.schemes import scheme_named
 from patches.closed_cages import CLOSED_CAGES, SURFACES, cage_of, polygons, torus, triangulated
@@ -21,7 +21,7 @@ def patch_table(scheme, cage):
 
 
 def signature_of(table, corner):
-    return signature_at(table.topology, int(table.half_edge_of_corner[corner]), table.scheme.element)
+    return signatures_at(table.topology, table.half_edge_of_corner[[corner]], table.scheme.element)[0]
 
 
 def turns(signature, corner_count):

@@ -23,8 +23,7 @@ def test_tips_keep_fewer_levels_as_pieces_where_these_would_take_too_much_memory
     surface = LimitSurface(extraordinary(13))
 
     def made(levels=3):
-        cage = surface.cage
-        table = PieceTable.build(surface.patches, cage.cut_mesh.vertex, cage.vertex_count, levels)
+        table = PieceTable.build(surface.patches, piece_levels=levels)
         return table.piece_levels, PACKET * piece_packets(16) * table.piece_count
 
     every = [made(levels) for levels in range(4)]
@@ -40,7 +39,7 @@ def test_tips_keep_fewer_levels_as_pieces_where_these_would_take_too_much_memory
 def test_regular_pieces_do_not_take_levels_from_tips(monkeypatch):
     monkeypatch.setattr(layout, "COEFFICIENT_BYTES", 1)
     surface = LimitSurface(sheet(5, 4))
-    table = PieceTable.build(surface.patches, surface.cage.cut_mesh.vertex, surface.cage.vertex_count)
+    table = PieceTable.build(surface.patches)
     assert table.piece_levels == PIECE_LEVELS
 
 

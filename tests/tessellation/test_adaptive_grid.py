@@ -10,9 +10,9 @@ from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurfac
 from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.tessellation import adaptive
+from mitsuba_subdivision.tessellation.adaptive import feature_edges
 from mitsuba_subdivision.tessellation.adaptive_grid import PatchFrames
 from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
-from mitsuba_subdivision.tessellation.tile_rates import feature_edges
 from patches.closed_cages import bumpy
 from tessellation.distances import distances_of_pairs
 from tessellation.test_attribute_table import EVERY_CAGE, with_seams
@@ -191,7 +191,7 @@ def test_edges_are_features_where_faces_lie_back_to_back(cage, is_folded):
     """Not where they are at right angles."""
     surface = LimitSurface(cage)
     vertex = surface.cage.cut_mesh.vertex
-    frames, criterion = PatchFrames.of(surface.patches, vertex), Criterion(Measure.CHORD, 1e-3)
+    frames, criterion = PatchFrames.of(surface.patches), Criterion(Measure.CHORD, 1e-3)
     assert (feature_edges(surface.patches, frames, cage.positions[vertex], criterion) == is_folded).all()
 
 

@@ -14,9 +14,9 @@ from mitsuba_subdivision.evaluation.patch_tree import patch_trees
 from mitsuba_subdivision.schemes import CatmullClark
 from mitsuba_subdivision.schemes.scheme import StencilTable
 from mitsuba_subdivision.surface import LimitSurface
+from mitsuba_subdivision.tessellation.adaptive import TileRates, _extent, _normals_to
 from mitsuba_subdivision.tessellation.adaptive_grid import PatchFrames, whole_patches
 from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
-from mitsuba_subdivision.tessellation.tile_rates import TileRates, _extent, _normals_to
 from scipy import sparse
 
 # Samples along each side, less one. They miss this part of an extent at most: a smooth function is lower by an eighth
@@ -129,7 +129,7 @@ def test_a_tile_without_a_normal_is_no_smaller_than_it_is():
     positions = np.ones((cage.vertex_count, 3))
     positions[[faces[face, (corner + 2) % 4] for face, corner in np.argwhere(faces == center)]] = -1
     surface = LimitSurface(cage.with_positions(positions), scheme)
-    frames = PatchFrames.of(surface.patches, surface.cage.cut_mesh.vertex)
+    frames = PatchFrames.of(surface.patches)
     error, larger = np.linalg.norm(np.ptp(positions, axis=0)) * (1 + ROUNDING), 0
     rates = TileRates(scheme, frames, Criterion(Measure.CHORD, error), 64)
     for tile, values, samples in tiles_of(surface, scheme):

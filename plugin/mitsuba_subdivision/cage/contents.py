@@ -50,8 +50,9 @@ class Attribute:
     def __init__(
         self, values: ArrayLike, interpolation: Interpolation = "vertex", indices: ArrayLike | None = None
     ) -> None:
-        indices = None if indices is None else _array(indices)
-        vars(self).update(values=_array(values), interpolation=interpolation, indices=indices)
+        object.__setattr__(self, "values", _array(values))
+        object.__setattr__(self, "interpolation", interpolation)
+        object.__setattr__(self, "indices", None if indices is None else _array(indices))
 
 
 def validated_attribute(
@@ -77,11 +78,10 @@ def validated_attribute(
             raise CageError(f"{label} has {len(values)} values; expected {topology.vertex_count}, one per vertex")
         return Attribute(values, interpolation)
     corner_count = topology.half_edge_count
-    if indices is None:
-        if len(values) != corner_count:
-            expected = f"expected {corner_count} values, one per face corner"
-            raise CageError(f"{label} has {len(values)} values and no indices; {expected}")
-        indices = np.arange(corner_count)
+    if indices is None and len(values) != corner_count:
+        expected = f"expected {corner_count} values, one per face corner"
+        raise CageError(f"{label} has {len(values)} values and no indices; {expected}")
+    indices = np.arange(corner_count) if indices is None else indices
     # Not copied before the length is checked, as a damaged file may have any number of indices.
     if indices.shape != (corner_count,) or not np.issubdtype(indices.dtype, np.integer):
         raise CageError(
@@ -119,7 +119,7 @@ def _validated_values(unchecked: NDArray, label: str, width: int | None) -> NDAr
 
 
 def _array(values: ArrayLike) -> NDArray:
-    """Return an array, or a zero-dimensional object array if ``values`` are none; the cage then raises an error."""
+    """An array, or a zero-dimensional object array if ``values`` are none; the cage then raises an error."""
     try:
         return np.asarray(values)
     except (TypeError, ValueError):  # Such as rows of different lengths.
@@ -130,11 +130,7 @@ def _array(values: ArrayLike) -> NDArray:
 
 @dataclass(frozen=True, eq=False)
 class CageContents:
-    """Contents of a file with a control cage, not yet validated.
-
-    Readers of files return it, and `ControlCage.from_arrays` validates it. Writers of files take the contents of a
-    cage, `ControlCage.contents`.
-    """
+    """Contents of a file with a control cage, not yet validated: readers return them, writers take them."""
 
     positions: NDArray  # (n_v, 3)
     face_sizes: IntArray  # (n_f,) int: number of vertices of each face

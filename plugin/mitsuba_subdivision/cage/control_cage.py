@@ -185,24 +185,25 @@ class ControlCage:
             **rules,
         ).shared()
         topology = structure.topology
-        vars(self).update(
-            positions=validated,
-            structure=structure,
-            texcoords=(
-                None if texcoords is None else validated_attribute(texcoords, "texcoords", topology, source, order, 2)
-            ),
-            attributes={
-                name: validated_attribute(attribute, name, topology, source, order)
-                for name, attribute in attributes.items()
-            },
-            materials={
+
+        def checked(given: Attribute | ArrayLike, name: str, width: int | None = None) -> Attribute:
+            return validated_attribute(given, name, topology, source, order, width)
+
+        values = {
+            "positions": validated,
+            "structure": structure,
+            **{item.name: getattr(structure, item.name) for item in fields(structure)},
+            "texcoords": None if texcoords is None else checked(texcoords, "texcoords", 2),
+            "attributes": {name: checked(attribute, name) for name, attribute in attributes.items()},
+            "materials": {
                 name: validated_face_indices(topology, faces, "material face", source)
                 for name, faces in (materials or {}).items()
             },
-            scheme=scheme,
-            source=source,
-            **{attribute.name: getattr(structure, attribute.name) for attribute in fields(structure)},
-        )
+            "scheme": scheme,
+            "source": source,
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
 
     @classmethod
     def from_arrays(
@@ -310,9 +311,7 @@ class ControlCage:
             )
         cage = type(self).__new__(type(self))
         # Without what a derived class has cached.
-        names = {attribute.name for attribute in fields(self)}
-        values = {name: value for name, value in vars(self).items() if name in names}
-        vars(cage).update(values, positions=validated)
+        vars(cage).update({item.name: getattr(self, item.name) for item in fields(self)}, positions=validated)
         return cage
 
     def refined(self, scheme: str | Scheme | None = None) -> ControlCage:
@@ -489,7 +488,7 @@ class _FlatFaces(NamedTuple):
 
 
 def _attribute_properties(contents: CageContents, mi: Any) -> dict[str, Any]:
-    """Return tensors of the values and of the indices of texture coordinates and attributes."""
+    """Tensors of the values and of the indices of texture coordinates and attributes."""
     named = [
         (f"{attribute.interpolation}_{name}", f"face_varying_{name}_indices", attribute)
         for name, attribute in contents.attributes.items()

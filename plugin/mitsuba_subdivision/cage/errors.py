@@ -88,10 +88,7 @@ def number_of_such(count: int, noun: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class CageSource:
-    """Origin of a control cage, which names the cage, its vertices and its faces in messages.
-
-    All methods take 0-based indices.
-    """
+    """Origin of a control cage, which names it, its vertices and its faces in messages, from 0-based indices."""
 
     name: str = "control cage"  # Of the whole cage; for a file, its quoted path
     index_base: int = 0  # Number of the first vertex and face in messages: 0 for arrays, 1 for OBJ files

@@ -54,12 +54,10 @@ def extraordinary(valence: int, *, closed: bool = True) -> ControlCage:
 
 
 def _prism_top(valence: int) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-    """Regular polygon at z = 1 with one square grid ("sector") per side. Its inscribed circle has radius 1.
+    """Regular polygon at z = 1 with one square grid ("sector") per side: positions, faces and the boundary loop.
 
-    In sector ``k``, vertices have coordinates (i, j) from the polygon's centre: i runs to the middle of side ``k``, j
-    to the middle of side ``k + 1``. The polygon's corner between these sides is opposite to the centre.
-
-    Returns positions, faces and the boundary loop.
+    Its inscribed circle has radius 1. In sector ``k``, vertices have coordinates (i, j) from the polygon's centre: i
+    runs to the middle of side ``k``, j to the middle of side ``k + 1``; the corner between is opposite to the centre.
     """
     rows = _SECTOR_ROWS
 

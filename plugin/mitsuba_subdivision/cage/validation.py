@@ -81,9 +81,8 @@ def validated_faces(
 ) -> tuple[Topology, NonManifold | None, IntArray | None]:
     """Check the faces of a cage, turn over those against their neighbours, and cut the mesh at non-manifold edges.
 
-    Raises CageError and warns as `ControlCage` says. Returns the topology, in which half-edges of non-manifold edges
-    have no twin, and vertices may have several fans; non-manifold edges and vertices, None for a manifold; and, if
-    faces were turned over, (n_h,) int64, the given face corner of each face corner of the topology.
+    Raises CageError and warns as `ControlCage` says. Returns `ControlCage.topology` and `ControlCage.non_manifold`;
+    and, if faces were turned over, (n_h,) int64, the given face corner of each face corner of the topology.
     """
     sizes = _integers(face_sizes, "face_sizes", source)
     vertices = _integers(face_vertices, "face_vertices", source, sizes)
@@ -122,8 +121,6 @@ def validated_faces(
 
 
 def _require_manifold(t: Topology, source: CageSource) -> None:
-    """Raise CageError about the first face, edge or vertex where a mesh is no oriented manifold."""
-
     def edge_at(half_edge: int) -> str:
         return source.edge(t.face_vertices[half_edge], t.face_vertices[t.next[half_edge]])
 
@@ -157,7 +154,7 @@ def _require_manifold(t: Topology, source: CageSource) -> None:
 
 
 def _description(t: Topology, non_manifold: NonManifold, source: CageSource) -> str:
-    """Return the warning about non-manifold edges and vertices: the number of each kind, and the first ones."""
+    """The warning about non-manifold edges and vertices: the number of each kind, and the first ones."""
     half_edges = np.flatnonzero(non_manifold.is_edge & ~non_manifold.has_one_face)
     # One half-edge of each edge.
     crowded = half_edges[np.unique(non_manifold.edge[half_edges], return_index=True)[1]]
@@ -219,10 +216,7 @@ def read_only(array: NDArray) -> NDArray:
 
 
 def _integers(values: ArrayLike, name: str, source: CageSource, sizes: IntArray | None = None) -> NDArray[np.integer]:
-    """Check that values are a flat array of an integer type, and return it.
-
-    If the values are vertices of faces, ``sizes`` are the face sizes, to name the first invalid face.
-    """
+    """Check that values are a flat array of integers; ``sizes`` are those of faces, if it has their vertices."""
     array = np.asarray(values)
     if array.ndim != 1:
         raise CageError(f"{source.name}: {name} has shape {array.shape}; expected a flat array of integers")
@@ -241,7 +235,6 @@ def _integers(values: ArrayLike, name: str, source: CageSource, sizes: IntArray 
 
 
 def _face_of(sizes: IntArray, corner: int) -> int:
-    """Return the face to which a face corner belongs."""
     return int(np.searchsorted(np.cumsum(sizes), corner, side="right"))
 
 
@@ -339,7 +332,7 @@ def validated_edges(topology: Topology, edges: ArrayLike, source: CageSource) ->
 def _sharpness(
     count: int, indices: IntArray, values: NDArray[np.float64], twins: IntArray | None = None
 ) -> NDArray[np.float64]:
-    """Return a read-only array of values, clamped to `INFINITE`, at ``indices`` and at twins of these; else zero."""
+    """A read-only array of values, clamped to `INFINITE`, at ``indices`` and at twins of these; else zero."""
     if not len(indices):
         return np.broadcast_to(0.0, count)
     sharpness = np.zeros(count)
@@ -367,17 +360,15 @@ def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) ->
     """Return a half-edge between each pair of vertices, in either direction; -1 if there is none."""
     if not len(starts):
         return np.zeros(0, dtype=np.int64)
-    n = topology.vertex_count
-    half_edges = topology.edge_half_edge
-    a, b = topology.face_vertices[half_edges], topology.face_vertices[topology.next[half_edges]]
-    keys = np.minimum(a, b).astype(np.int64) * n + np.maximum(a, b)
+    t, n, half_edges = topology, topology.vertex_count, topology.edge_half_edge
+    low, high = np.sort([t.face_vertices[half_edges], t.face_vertices[t.next[half_edges]]], axis=0).astype(np.int64)
     # If several edges have the same vertices, the first is used.
-    order = np.argsort(keys, kind="stable")
-    pair_keys = np.minimum(starts, ends) * n + np.maximum(starts, ends)
-    index = np.minimum(np.searchsorted(keys[order], pair_keys), len(keys) - 1)
-    candidate = order[index]
-    inside = (np.minimum(starts, ends) >= 0) & (np.maximum(starts, ends) < n)
-    return np.where(inside & (keys[candidate] == pair_keys), half_edges[candidate], -1)
+    order = np.argsort(low * n + high, kind="stable")
+    first, last = np.sort([starts, ends], axis=0)
+    index = np.searchsorted((low * n + high)[order], first * n + last)
+    candidate = order[np.minimum(index, len(order) - 1)]
+    is_edge = (first >= 0) & (last < n) & (low[candidate] == first) & (high[candidate] == last)
+    return np.where(is_edge, half_edges[candidate], -1)
 
 
 def require_sharpness(values: NDArray[np.float64], where: Callable[[int], str]) -> None:

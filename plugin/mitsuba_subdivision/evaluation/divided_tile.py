@@ -72,10 +72,7 @@ class DividedTile:
 
     @cached_property
     def control_faces(self) -> IntArray:
-        """``(4, f)`` control points: ends of one diagonal, then of the other, of the one-ring's faces.
-
-        For triangles, two sides in place of diagonals. A piece has no faces.
-        """
+        """``(4, f)`` control points of the one-ring's faces: ends of both diagonals; of two sides of triangles."""
         if self._element is None:
             return np.empty((4, 0), dtype=np.int64)
         t = one_ring(self._element.signature).topology
@@ -136,8 +133,7 @@ class DividedTile:
     ) -> tuple[list[FloatArray], list[tuple[DividedTile, FloatArray]]]:
         """Divide the tile; with ``side``, only along one side.
 
-        Returns the Bernstein coefficients ``(b, K)`` of pieces, or of their sides, and the undivided tiles with the
-        stencils of their control points.
+        Returns Bernstein coefficients ``(b, K)`` of pieces, or of their sides, and undivided tiles with their stencils.
         """
         identity, m = self._control_points, self._scheme.domain.corner_count
         if self.is_piece:
@@ -161,10 +157,7 @@ def part_of_tile(
     element: PatchTree,
     stencils: FloatArray,  # (K_element, K) float64: the element's control points over those of the parent tile
 ) -> tuple[DividedTile, FloatArray]:
-    """Return the tile of an element that is a part of a parent tile; equal tiles are the same object.
-
-    Also returns the tile's control points over those of the parent tile, (n, K) float64.
-    """
+    """Return the tile of an element in a parent tile, one object for equal ones, and its stencils over the parent's."""
     if element.kind == PartKind.ONLY_CHILD:
         ((child, child_stencils),) = element.children
         return part_of_tile(child, child_stencils @ stencils)

@@ -60,12 +60,10 @@ class Eigenbasis:
         return matrix
 
     def power_terms(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the first powers of T as sums of terms of rank one.
+        """Return left (K, t), right (t, K) and factors (count, t): ``T**n`` is ``left @ diag(factors[n]) @ right``.
 
-        ``T**n`` is ``left @ diag(factors[n]) @ right``. The first K terms are those of the eigenvectors. What a block
-        adds to the powers of its eigenvalue has the rank of its Jordan blocks, which are few.
-
-        Returns left (K, t), right (t, K) and factors (count, t).
+        The first K terms are those of the eigenvectors. What a block adds to the powers of its eigenvalue has the rank
+        of its Jordan blocks, which are few.
         """
         size, exponents = len(self.eigenvalues), np.arange(count)
         left: list[FloatArray] = [np.eye(size)]
@@ -77,10 +75,7 @@ class Eigenbasis:
             added: FloatArray = np.stack(powers)
             columns, sizes, _ = np.linalg.svd(added.swapaxes(0, 1).reshape(len(block), -1), full_matrices=False)
             rank = int(np.count_nonzero(sizes > DIAGONAL))
-            columns, rows = (
-                columns[:, :rank],
-                np.linalg.svd(added.reshape(-1, len(block)), full_matrices=False)[2][:rank],
-            )
+            columns, rows = columns[:, :rank], np.linalg.svd(added.reshape(-1, len(block)), False)[2][:rank]
             left.append(np.repeat(np.eye(size)[:, block_slice] @ columns, rank, axis=1))
             right.append(np.tile(rows @ np.eye(size)[block_slice], (rank, 1)))
             factors.append((columns.T @ added @ rows.T).reshape(count, -1))
@@ -99,11 +94,7 @@ class Eigenbasis:
 def eigenbasis(
     matrix: FloatArray,  # (K, K) float64: rows sum to one, 1 is a simple eigenvalue, and all others are smaller
 ) -> Eigenbasis:
-    """Compute the eigenbasis of a subdivision matrix.
-
-    ``numpy.linalg.eig`` alone is not enough, see section 6 of plugin/MATHEMATICS.md. So close eigenvalues are grouped
-    into clusters. The basis consists of an orthonormal basis of each cluster's invariant subspace, computed by inverse
-    iteration where the eigenvectors are dependent. In this basis the matrix is block-diagonal.
+    """Compute the eigenbasis of a subdivision matrix, by section 6 of plugin/MATHEMATICS.md.
 
     Raises EigenbasisError if the second eigenvalue is not below one, distinct eigenvalues are too close to separate
     their vectors, or one of ``A V = V T``, ``L V = 1`` and ``A^20 = V T^20 L`` does not hold to 1e-10.
@@ -157,10 +148,7 @@ def _require_basis(matrix: FloatArray, basis: Eigenbasis) -> None:
 
 
 def _clusters(eigenvalues: NDArray[np.complex128]) -> list[NDArray[np.int64]]:
-    """Return indices of equal or conjugate eigenvalues for each cluster, by decreasing modulus.
-
-    Of opposite eigenvalues the positive one comes first.
-    """
+    """Return indices of equal or conjugate eigenvalues, by decreasing modulus; of opposite ones the positive first."""
     points = eigenvalues.real + 1j * np.abs(eigenvalues.imag)
     left = np.lexsort((-points.real, -np.round(np.abs(points) / CLUSTER_WIDTH)))
     clusters = []
@@ -188,10 +176,7 @@ def _subspace(
     eigenvectors: NDArray[np.complex128],
     members: NDArray[np.int64],  # Indices of the eigenvalues of a cluster
 ) -> FloatArray:
-    """Return an orthonormal basis of the invariant subspace of a cluster of eigenvalues.
-
-    Where the eigenvectors are dependent, it is computed by block inverse iteration.
-    """
+    """Return an orthonormal basis of a cluster's invariant subspace, by block inverse iteration if need be."""
     vectors, count = eigenvectors[:, members], len(members)
     left, singular, _ = np.linalg.svd(np.hstack([vectors.real, vectors.imag]), full_matrices=False)
     block: FloatArray = left[:, :count]

@@ -145,11 +145,7 @@ def element_stencils(
 
 
 def derivative_stencils(located: LocatedSamples, derivatives: int) -> list[FloatArray]:
-    """Compute the weights over one-rings that `evaluate_samples` applies to control points.
-
-    Returns list of (s_element, 3 or 6, K) float64: for each element, weights of the point; of the derivatives by u and
-    v; of those by uu, uv and vv.
-    """
+    """Weights of points and derivatives, ``(s_element, 3 or 6, K)`` float64, over the one-ring of each element."""
     rows = located.rows("stabilized", np.float64, derivatives)
     weights, scale = located.weights([r.rows for r in rows]), located.per_sample([r.derivative_scale for r in rows])
     for stencils, samples in zip(weights, located.slices(), strict=True):
@@ -162,10 +158,8 @@ def derivative_stencils(located: LocatedSamples, derivatives: int) -> list[Float
 
 def _times_points(weights: list[FloatArray], points: list[FloatArray]) -> FloatArray:
     """Return ``(d, x, s)``: for each element, weights ``(m, d, K)`` times control points ``(m, K, x)`` of samples."""
-    return np.concatenate(
-        [(w.astype(p.dtype, copy=False) @ p).transpose(1, 2, 0) for w, p in zip(weights, points, strict=True)],
-        axis=2,
-    )
+    pairs = zip(weights, points, strict=True)
+    return np.concatenate([(w.astype(p.dtype, copy=False) @ p).transpose(1, 2, 0) for w, p in pairs], axis=2)
 
 
 def _chosen(points: list[FloatArray], located: LocatedSamples, which: IntArray) -> list[FloatArray]:
@@ -212,10 +206,7 @@ def curvature(
     first: FloatArray,  # (2, s, 3): derivatives by u, by v
     second: FloatArray,  # (3, s, 3): by uu, uv, vv
 ) -> FloatArray:
-    """Compute curvatures from the fundamental forms.
-
-    Returns (2, s): Gaussian and mean; the mean is positive where the surface bends towards ``du x dv``.
-    """
+    """Compute Gaussian and mean curvature ``(2, s)``; the mean is positive where it bends towards ``du x dv``."""
     du, dv = first
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         a, b, c = _dot(du, du), _dot(du, dv), _dot(dv, dv)
@@ -230,17 +221,17 @@ def irregular_curvature(
     uv: FloatArray,  # (s, 2) float64: parameters in the patch
     coordinates: FloatArray,  # (s, K, 3): eigen-coordinates of each sample's element
 ) -> FloatArray:
-    """Compute curvatures in an irregular patch, in the frame of its limit normal.
-
-    Near the extraordinary point second derivatives are almost tangential, and their small normal part is lost to
-    rounding. So coordinates in the limit tangent plane and heights over it are summed separately, with powers of λ_2
-    and λ_4, see section 9 of plugin/MATHEMATICS.md.
+    """Compute curvatures in the frame of the limit normal, by section 9 of plugin/MATHEMATICS.md.
 
     Returns (2, s): Gaussian and mean. At the extraordinary point itself 0 where the curvature vanishes there, else NaN.
     """
     level, rows = child_rows(patch.scheme, uv, patch.eigen_children.astype(coordinates.dtype), 2)
     largest, second_largest = patch.basis.subdominant, float(patch.basis.moduli[3])
-    frame = _orthonormal_frames(coordinates)
+    # Two tangents at the extraordinary point, and the normal.
+    first, normal = coordinates[:, 1], unit_normals(coordinates[:, 1:3].transpose(1, 2, 0)).T
+    with np.errstate(invalid="ignore", divide="ignore"):
+        along = first / np.linalg.norm(first, axis=1, keepdims=True)
+    frame = np.stack([along, np.cross(normal, along), normal], axis=2)
     local = np.einsum("ekx,exf->ekf", coordinates, frame)
     local[:, :3, 2] = 0
 
@@ -264,15 +255,6 @@ def irregular_curvature(
     curvatures = np.stack([gaussian, mean])
     curvatures[:, patch.scheme.domain.extent(uv) == 0] = 0 if growth < 1 - CONSTANT else np.nan
     return curvatures
-
-
-def _orthonormal_frames(coordinates: FloatArray) -> FloatArray:
-    """Return ``(e, 3, 3)`` orthonormal frames: columns are two tangents at the extraordinary point and the normal."""
-    first = coordinates[:, 1]
-    normal = unit_normals(coordinates[:, 1:3].transpose(1, 2, 0)).T
-    with np.errstate(invalid="ignore", divide="ignore"):
-        along = first / np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([along, np.cross(normal, along), normal], axis=2)
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:

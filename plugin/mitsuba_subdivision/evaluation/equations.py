@@ -64,16 +64,14 @@ class SampleRows:
 
 
 def locate(domain: ParameterDomain, uv: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
-    """Return each sample's level n, its regular child (0, 1, 2 for k = 1, 2, 3), and (u', v') in that child.
+    """Return each sample's level n, its regular child (0, 1, 2 for k = 1, 2, 3), and (u', v') there, all exact.
 
-    All three are exact. At (0, 0) the level is 0, and child and parameters are meaningless.
+    At (0, 0) the level is 0, and child and parameters are meaningless.
     """
     _, exponent = np.frexp(domain.extent(uv))
     level = np.maximum(-exponent.astype(np.int64), 0)
-    magnified = np.ldexp(uv, level[:, None])
-    candidates = np.stack([child(magnified) for child in domain.children[1:]])
-    child = np.argmax(domain.inside(candidates), axis=0)
-    return level, child, candidates[child, np.arange(len(uv))]
+    number, u, v, _ = domain.child_at(*np.ldexp(uv, level[:, None]).T)
+    return level, np.maximum(number, 1) - 1, np.stack([u, v], axis=1)
 
 
 def child_rows(
@@ -84,9 +82,9 @@ def child_rows(
     tables: FloatArray,
     derivatives: int,
 ) -> tuple[NDArray[np.int64], FloatArray]:
-    """Compute the factors that all forms share: ``bᵀ P_k Ā``, ``2 s_k b_uᵀ P_k Ā`` and so on, the rows of level 0.
+    """Return levels ``(s,)``, and rows of level 0, which all forms share: ``bᵀ P_k Ā``, ``2 s_k b_uᵀ P_k Ā`` and so on.
 
-    Returns the level of each sample, (s,) int64, and rows, (3, s, K) or (6, s, K).
+    The rows are ``(3, s, K)`` or ``(6, s, K)``.
     """
     level, child, local = locate(scheme.domain, uv)
     rows = np.empty((3 * derivatives, len(uv), tables.shape[2]), dtype=tables.dtype)
@@ -131,7 +129,7 @@ def stam_rows(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasis) -> 
 def stabilized_rows(rows: FloatArray, level: NDArray[np.int64], basis: Eigenbasis) -> tuple[FloatArray, FloatArray]:
     """Apply equations (10) and (12), over the eigen-coordinates: ``bᵀ P_k Ā v_i`` times ``(λ_i / λ_2)ⁿ``.
 
-    Returns rows whose derivatives lack the factors ``(2 λ_2)ⁿ`` and ``(4 λ_2)ⁿ``, and these factors, (2, s).
+    Derivatives lack the factors ``(2 λ_2)ⁿ`` and ``(4 λ_2)ⁿ``, which are returned, too, (2, s).
     """
     lambda_2 = rows.dtype.type(basis.subdominant)
     occurring, which = distinct_levels(level)
@@ -158,8 +156,6 @@ def times_powers(
     """Multiply each sample's row by ``(T / base)ⁿ``: its entries by ``(λ_i / base)ⁿ``.
 
     Terms of eigenvalues larger than the base become zero, as the stabilised forms require.
-
-    Returns (d, s, K) of the same precision.
     """
     real = rows.dtype.type
     kept = basis.moduli <= base * (1 + CLUSTER_WIDTH)

@@ -60,10 +60,7 @@ class IrregularPatch:
 
     @cached_property
     def basis(self) -> Eigenbasis:
-        """Eigenbasis of A, oriented so that the characteristic map preserves the orientation of the parameters.
-
-        Raises SchemeError if the rules do not contract the one-ring to a point.
-        """
+        """Eigenbasis of A, with a positive f of (13). Raises SchemeError if the rules do not contract the one-ring."""
         try:
             basis = eigenbasis(self.matrix)
         except EigenbasisError as error:
@@ -81,18 +78,12 @@ class IrregularPatch:
 
     @cached_property
     def limit_frame(self) -> FloatArray:
-        """``(2, K)`` float64, over the eigen-coordinates: tangents at the extraordinary point.
-
-        Their cross product is along the normal.
-        """
+        """`normals.limit_frame` at the extraordinary point: ``(2, K)`` float64, over the eigen-coordinates."""
         return limit_frame(self.scheme, self.signature, self.basis)
 
     @cached_property
     def edge_tangents(self) -> FloatArray:
-        """``(2, K)`` float64, over the eigen-coordinates: tangents at the extraordinary point along its two edges.
-
-        The edges are ``v = 0`` and ``u = 0``.
-        """
+        """``(2, K)`` float64, over the eigen-coordinates: tangents at the point along ``v = 0`` and ``u = 0``."""
         # The characteristic map at (1, 0) and (0, 1) gives the directions of the two edges.
         scheme = self.scheme
         _, ends = child_rows(scheme, scheme.domain.corners[[1, -1]], self.eigen_children[:, :, 1:3], 1)
@@ -149,10 +140,7 @@ class IrregularPatch:
 
 
 def level_polynomials(patch: IrregularPatch, form: FloatArray, levels: NDArray[np.int64]) -> FloatArray:
-    """Return ``(l, 3, m, K)`` coefficients of the regular pieces of levels over eigen-coordinates.
-
-    ``form``, ``(m, R)``, maps the control points of a regular patch to coefficients.
-    """
+    """Return ``(l, 3, m, K)`` coefficients, by ``form``, ``(m, R)``, of regular pieces over eigen-coordinates."""
     rows: FloatArray = form @ patch.eigen_children
     flat = np.repeat(rows.reshape(-1, 1, rows.shape[2]), len(levels), axis=1)
     powers = times_powers(flat, levels, patch.basis, 1.0).reshape(*rows.shape[:2], len(levels), rows.shape[2])
@@ -187,11 +175,10 @@ def float32_levels(patch: IrregularPatch) -> int:
 
 @lru_cache(maxsize=1024)
 def rest_rows(patch: IrregularPatch) -> FloatArray:
-    """Return a bound of the distance from the extraordinary point to the surface at a level and all later ones.
+    """Return ``(r, K)`` rows that bound the distance of the surface from the extraordinary point from a level on.
 
-    Returns ``(r, K)``, read-only, to be multiplied by the absolute eigen-coordinates of the level, which
-    are ``Tⁿ`` times those of the patch. The largest of the r sums is the bound, see section 14 of
-    plugin/MATHEMATICS.md. A weaker bound is the one sum with the largest entry of each column.
+    The largest of their products with the absolute eigen-coordinates of the level, which are ``Tⁿ`` times those of the
+    patch, is the bound: section 14 of plugin/MATHEMATICS.md. A weaker one is their largest entries' sum.
     """
     rows, step = level_rows(patch, 0).reshape(-1, len(patch.basis.eigenvalues)), patch.basis.block_matrix()
     bound = np.abs(rows)

@@ -69,11 +69,7 @@ class Leaves:
 
 
 class LocatedSamples:
-    """Samples, and the leaves of patch trees that contain them.
-
-    Raises SchemeError if refinement does not separate the irregularities of a one-ring, or a feature always stays
-    semi-sharp.
-    """
+    """Samples, and the leaves of patch trees that contain them. Raises SchemeError as `patch_trees` does."""
 
     def __init__(
         self,
@@ -113,7 +109,7 @@ class LocatedSamples:
                 break
             divide(trees[number] for number in inner)
             in_inner, begins = np.concatenate([samples[number] for number in inner]), np.cumsum(counts) - counts
-            child, child_uv = domain.first_child(uv[in_inner].T)
+            child, *child_uv, _ = domain.child_at(*uv[in_inner].T)
             is_only = np.repeat([trees[number].kind == PartKind.ONLY_CHILD for number in inner], counts)
             # Children at corners are numbered from the element's first corner; the middle of a triangle comes last.
             corners = domain.corner_count
@@ -231,10 +227,9 @@ def by_uv(tangents: FloatArray, jacobian: FloatArray) -> FloatArray:
 def limit_stencils(located: LocatedSamples) -> list[FloatArray]:
     """Compute limit stencils of samples over the one-rings of their elements: (s_element, 3, K) float64 for each.
 
-    These are weights of the point, which sum to one, and of two tangents, which sum to zero. The cross product of the
-    tangents is along the normal, also at extraordinary points. Away from extraordinary points, borders and sharp
-    features, the tangents are the derivatives times a positive factor, which may differ between samples. They are zero
-    where the surface is folded for all control points.
+    These are weights of the point, and of two tangents whose cross product is along the normal. Away from extraordinary
+    points, borders and sharp features, these are the derivatives times a positive factor, which may differ between
+    samples. They are zero where the surface is folded for all control points.
     """
     rows = located.rows("stabilized", np.float64, 1)
     stencils = located.weights([np.concatenate([leaf_rows.rows[:1], leaf_rows.tangents]) for leaf_rows in rows])
@@ -264,13 +259,10 @@ def sampled_polynomials(
     elements: Sequence[PatchTree],  # All different
     uv: Sequence[FloatArray],  # (s_element, 2) float64: samples of each element
 ) -> tuple[Polynomials, Polynomials]:
-    """Return planes, and polynomials of the scheme's `PolynomialBasis`, that evaluate samples.
+    """Return planes, and polynomials of the scheme's `PolynomialBasis`, that evaluate samples, each by one of the two.
 
-    Each sample has one of the two. Normals are along the cross product of the derivatives. The derivatives of planes
-    are tangents of any length.
-
-    Raises SchemeError if refinement does not separate the irregularities of a one-ring, or a feature always stays
-    semi-sharp.
+    Normals are along the cross product of the derivatives. The derivatives of planes are tangents of any length. Raises
+    SchemeError as `patch_trees` does.
     """
     element = np.repeat(np.arange(len(elements)), [len(element_uv) for element_uv in uv])
     located = LocatedSamples(scheme, elements, element, np.concatenate(uv), 0 * element)
@@ -296,10 +288,7 @@ def sampled_polynomials(
 
 
 def _in_pieces(scheme: Scheme, leaves: Leaves) -> tuple[IntArray, FloatArray]:
-    """Return the piece of each sample, -1 for samples that need a plane, and ``(2, n)`` parameters in the piece.
-
-    Parameters are relative to the middle of the domain.
-    """
+    """Return pieces of samples, -1 for those that need a plane; and ``(2, n)`` parameters there, from its middle."""
     local, number = leaves.uv, np.zeros(len(leaves.uv), dtype=np.int64)
     if leaves.patch is not None:
         level, child, local = locate(scheme.domain, leaves.uv)

@@ -21,14 +21,10 @@ from ..schemes.scheme import Scheme
 from .eigenbasis import Eigenbasis
 from .equations import times_powers
 
-# Bound of the rounding error of a tangent's coordinate, relative to the sum of its absolute terms, by the number of
-# bits of the type. A cross product within the resulting error counts as zero. In single precision this is the error of
-# sums of some thirty terms. In double precision it allows for errors of weights, which are correct to 1e-14, and for
-# control points that are a hundred times farther from the origin than from each other.
+# By the number of bits of the type, see section 8 of plugin/MATHEMATICS.md: bound of the rounding error of a tangent's
+# coordinate, relative to the sum of its absolute terms, within which a cross product counts as zero; and lower bound of
+# the extent of control points that are sums of others, relative to their distance from the origin.
 TANGENT_ROUNDING = {32: 2.0**-19, 64: 2.0**-40}
-# Lower bound of the extent of control points, relative to their distance from the origin, by the number of bits.
-# Control points that are sums of others have errors of two roundings of their coordinates, however close to each other
-# they are.
 LEAST_EXTENT = {32: 2.0**-3, 64: 2.0**-11}
 # The smallest normal number by the number of bits; replaces a length of zero.
 LEAST_LENGTH = {32: 2.0**-126, 64: 2.0**-1022}
@@ -49,8 +45,7 @@ def unit_normals(
 
     Coordinates are along the axis before samples, as operations along a last axis of length three are slow. Vectors are
     zero where the cross product is zero. With weights and extent, they are also zero where it is within its rounding
-    error, as the surface is folded or collapses to a curve or a point. The error is bounded for each coordinate
-    separately, so tangents may have very different lengths, and very thin cages have normals.
+    error, as the surface is folded or collapses to a curve or a point: section 8 of plugin/MATHEMATICS.md.
     """
     with np.errstate(invalid="ignore", divide="ignore", over="ignore", under="ignore"):
         longest = np.maximum(np.abs(tangents).max(axis=1), LEAST_LENGTH[8 * tangents.dtype.itemsize])
@@ -65,13 +60,8 @@ def unit_normals(
     return normal
 
 
-def _are_rounding(
-    pair: FloatArray,  # (2, 3, ...): tangents, each divided by its largest component
-    squared: FloatArray,  # (...): squared lengths of their cross products
-    weights: FloatArray,  # (2, ...): divided by the same components
-    extent: FloatArray,  # (3, ...)
-) -> NDArray[np.bool_]:
-    """Return whether cross products are within the bound of their rounding errors."""
+def _are_rounding(pair: FloatArray, squared: FloatArray, weights: FloatArray, extent: FloatArray) -> NDArray[np.bool_]:
+    """Return whether cross products of ``pair``, of squared lengths ``squared``, are within their rounding errors."""
     error = TANGENT_ROUNDING[8 * pair.dtype.itemsize] * weights
     # First use a looser bound that is cheaper to compute. It may be NaN where tangents are zero.
     suspect = ~(squared > 12 * ((error[0] + error[1]) * extent.max(axis=0)) ** 2)
@@ -114,9 +104,8 @@ def _tip_weights(edge_count: int, turn: float) -> FloatArray:
     """Return the cosine and the sine of the angle of each edge at the tip of a cone: ``(2, edge_count)``.
 
     The surface has no normal there. Sums of the edge vectors with these weights give the same normal to all faces on
-    one side. The first and the last edge would not: they are opposite where two creases meet, and equal where a crease
-    ends. Angles between edges are taken as equal. Inside they add up to a full turn. In a corner each is that of a
-    regular border, or less, so that their sum is at most a full turn.
+    one side, where the first and the last edge would not: these are opposite where two creases meet, and equal where a
+    crease ends. Angles between edges are taken as equal, and add up to a full turn at most.
     """
     angles = turn * np.arange(edge_count)
     weights = np.stack([np.cos(angles), np.sin(angles)])
@@ -129,8 +118,7 @@ def _inward(basis: Eigenbasis, inner: int) -> FloatArray:
     """Return the eigenvector of the largest eigenvalue that leads inward from a border; ``inner`` is a vertex inside.
 
     The border curve depends on border vertices only, so the weights of inner vertices are zero in its eigenvectors.
-    With very many faces on one side the surface has no tangent plane, because inner modes contract no faster than the
-    border. This eigenvector then gives the limit along the border.
+    Where many faces on one side leave no tangent plane, this eigenvector gives the limit along the border.
     """
     weights = np.abs(basis.inverse[1:, inner]) / np.abs(basis.inverse[1:]).max(axis=1)
     mode = 1 + int(np.argmax(weights > INSIDE))
@@ -142,8 +130,7 @@ def _inward(basis: Eigenbasis, inner: int) -> FloatArray:
 def _across_lone_face(ring: OneRing, basis: Eigenbasis) -> FloatArray:
     """Return the direction across a face that is alone at a vertex on a border.
 
-    The face contracts by 1/4 across its corner. For quadrilaterals this eigenvalue has a Jordan block. The powers of
-    the block tend to the image of its nilpotent part.
+    It contracts by 1/4. Of a Jordan block, as for quadrilaterals, powers tend to the image of the nilpotent part.
     """
     inward = np.zeros(len(basis.eigenvalues))
     inward[2] = 1
@@ -161,11 +148,7 @@ def uneven_frame(
     level: NDArray[np.int64],  # (s,) int64
     basis: Eigenbasis,
 ) -> FloatArray:
-    """Compute the frame at a finite level, where the second eigenvalue is larger than the third, as on borders.
-
-    Returns (2, s, K): ``g_u S_u + g_v S_v`` and ``g_u S_v - g_v S_u`` with the coefficients g of the second eigenvector
-    in the derivatives, each divided by the power of its largest eigenvalue, see section 10 of plugin/MATHEMATICS.md.
-    """
+    """Compute t_1 and t_2 of section 10 of plugin/MATHEMATICS.md, ``(2, s, K)``, where λ_3 is smaller than λ_2."""
     by_u, by_v = tangents
     g_u, g_v = by_u[:, 1:2], by_v[:, 1:2]
     along, across = g_u * by_u + g_v * by_v, g_u * by_v - g_v * by_u

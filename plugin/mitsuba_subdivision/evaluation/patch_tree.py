@@ -104,12 +104,10 @@ class PatchTree:
 
     @cached_property
     def regular_count(self) -> int:
-        """Number of regular pieces."""
         return int(self.kind == PartKind.REGULAR) + sum(child.regular_count for child, _ in self.children)
 
     @cached_property
     def tip_count(self) -> int:
-        """Number of tips."""
         return int(self.kind == PartKind.TIP) + sum(child.tip_count for child, _ in self.children)
 
     @cached_property
@@ -137,10 +135,9 @@ class PatchTree:
 
     @cached_property
     def nodes(self) -> IntArray:
-        """``(n, 3)``: for each node of the tree `kind`, `turn` and the index of its first child; the root comes first.
+        """``(n, 3)``: `kind`, `turn` and first child of each node of the tree, from the root; children are consecutive.
 
-        The children of a node are consecutive. For a piece the last entry is its index among the pieces of its kind, in
-        the order of `coefficients` or `tips`.
+        For a piece the last entry is its index among those of its kind, in the order of `coefficients` or `tips`.
         """
         below = self._below + np.array([0, 0, 1]) * (self._below[:, :1] <= PartKind.ONLY_CHILD)
         return np.concatenate([[[self.kind, self.turn, int(self.piece is None)]], below])
@@ -292,7 +289,6 @@ class Piece:
 
     @property
     def irregular_patch(self) -> IrregularPatch:
-        """`patch`; raises ValueError for a regular piece."""
         if self.patch is None:
             raise ValueError("a regular piece; expected one with an extraordinary point")
         return self.patch
@@ -337,11 +333,9 @@ def isolated_signature(
 
 
 def _regular_fan(scheme: Scheme) -> Fan:
-    """Return the faces around a regular vertex."""
     return Fan((scheme.regular_face_size,) * scheme.regular_valence)
 
 
-@lru_cache(maxsize=4096)
 def rotation_order(signature: Signature, corner: int) -> IntArray:
     """Return indices of an element's control points in the order of ``signature.rotated(corner)``."""
     ring = one_ring(signature)
@@ -356,10 +350,7 @@ def rotation_order(signature: Signature, corner: int) -> IntArray:
 
 @lru_cache(maxsize=1024)
 def irregular_patch(scheme: Scheme, signature: Signature) -> IrregularPatch | None:
-    """Return the patch of a self-similar one-ring, or None if it is not self-similar.
-
-    In a self-similar one-ring child 0 has the same signature as the element, and the other children are regular.
-    """
+    """Return the patch of a self-similar one-ring: child 0 has its signature, all others are regular; else None."""
     count = len(scheme.domain.children)
     # The other corners of the element are corners of the regular children, too.
     if not all(_is_regular_fan(scheme, fan) for fan in signature.fans[1:]):
@@ -375,8 +366,10 @@ def irregular_patch(scheme: Scheme, signature: Signature) -> IrregularPatch | No
         regular_stencils.append(lattice @ child.stencils)
     children = np.stack(regular_stencils)
     slots = np.arange(len(matrix))
-    if (merged := _merged_slots(signature)) is not None:
-        kept, dropped = merged
+    if signature.fans[0].rule == VertexRule.DART:
+        # The other end of the sharp edge is two vertices of the one-ring, one on each side of the edge. As separate
+        # control points they would add an eigenvector that no cage can have.
+        kept, *_, dropped = one_ring(signature).edge_neighbours()
         slots = np.delete(slots, dropped)
         for weights in (matrix, children):
             weights[..., kept] += weights[..., dropped]
@@ -384,26 +377,11 @@ def irregular_patch(scheme: Scheme, signature: Signature) -> IrregularPatch | No
     return IrregularPatch(scheme, signature, slots, matrix, children)
 
 
-def _merged_slots(signature: Signature) -> tuple[int, int] | None:
-    """Return the vertex to keep and the vertex to drop of a pair that is one point, or None if there is no pair.
-
-    At a dart the other end of the sharp edge is two vertices of the one-ring, one on each side of the edge. As separate
-    control points they would add an eigenvector that no cage can have.
-    """
-    if signature.fans[0].rule != VertexRule.DART:
-        return None
-    first, *_, last = one_ring(signature).edge_neighbours()
-    return first, last
-
-
-@lru_cache(maxsize=1024)
 def lattice_stencils(scheme: Scheme, signature: Signature) -> FloatArray | None:
-    """Return stencils of the control points of a regular patch, in the order of the scheme's lattice.
+    """Return stencils ``(R, K)`` of the control points of a regular patch, in the order of the scheme's lattice.
 
-    Beside a border some control points are phantom points, computed from inner ones by the scheme's `phantom_points`.
-
-    Returns (R, K) float64, or None if the element is no regular patch. It is one if all its corners are regular: inside
-    the mesh, on a border or at a corner of the border.
+    None if a corner of the element is not regular: inside the mesh, on a border or at a corner of the border. Beside a
+    border some control points are phantom points, computed from inner ones.
     """
     if not (signature.kind == scheme.element and all(_is_regular_fan(scheme, fan) for fan in signature.fans)):
         return None
@@ -442,7 +420,6 @@ def _is_regular_fan(scheme: Scheme, fan: Fan) -> bool:
 
 
 def _lattice_points(scheme: Scheme, signature: Signature) -> list[tuple[float, float]]:
-    """Return the lattice point of each vertex of a regular one-ring."""
     topology = one_ring(signature).topology
     start = {0: (scheme.first_edge[0], scheme.first_edge[1] - scheme.first_edge[0])}
     point_of_vertex: dict[int, tuple[float, float]] = {}

@@ -30,10 +30,10 @@ ROUNDED = 1e-11
 
 @dataclass(frozen=True, eq=False)
 class BernsteinBasis:
-    """Bernstein basis of the polynomials over a parameter domain.
+    """Bernstein basis of the polynomials over a parameter domain [Farin 2002].
 
-    A tensor product over the unit square, and the basis of the total degree over the unit triangle. The functions are
-    non-negative and sum to one, so a polynomial's values lie in the convex hull of its coefficients [Farin 2002].
+    A tensor product over the unit square, and the basis of the total degree over the unit triangle. A polynomial's
+    values lie in the convex hull of its coefficients.
     """
 
     domain: ParameterDomain
@@ -74,10 +74,7 @@ class BernsteinBasis:
 
     @cached_property
     def halves(self) -> FloatArray:
-        """``(4, b, b)`` maps from coefficients to those over each child of the domain, as by de Casteljau's algorithm.
-
-        The order and the parameters are those of `ParameterDomain.children`.
-        """
+        """``(4, b, b)`` maps from coefficients to those over each of `ParameterDomain.children`."""
         sites = [child.inverse()(self._sites) for child in self.domain.children]
         return _clean(self.coefficients(np.stack([self.values(child_sites) for child_sites in sites])))
 
@@ -128,11 +125,7 @@ def _clean(matrix: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class PolynomialBasis:
-    """The regular basis of a scheme as polynomials about the middle of the domain.
-
-    Powers of the distance from the middle are small, so that single precision loses no more digits than in the scheme's
-    formulas.
-    """
+    """The regular basis of a scheme as polynomials about the middle of the domain, where powers stay small."""
 
     domain: ParameterDomain
     # (m, 2) int64: a and b of the monomials ``(u - u_0)^a (v - v_0)^b`` about the middle. The first is the constant.
@@ -156,10 +149,7 @@ class PolynomialBasis:
 
 
 def monomial_values(powers: IntArray, st: FloatArray) -> FloatArray:
-    """Return ``(3, m, s)`` values and derivatives of monomials at ``(s, 2)`` parameters relative to the middle.
-
-    Samples are along the last axis, so that NumPy's inner loops are long.
-    """
+    """Return ``(3, m, s)`` values and derivatives of monomials at ``(s, 2)`` parameters from the middle."""
     (a, b), (s, t) = powers.T, st.T
     power_s, power_t = (np.vander(x, int(powers.max()) + 1, increasing=True).T for x in (s, t))
     along_s, along_t = power_s[a], power_t[b]

@@ -78,7 +78,6 @@ def _check_basis(scheme: Scheme) -> None:
 
 
 def _check_basis_fits(scheme: Scheme, signature: Signature) -> None:
-    """Check that a regular patch and its refinement are the same surface."""
     lattice, uv = lattice_stencils(scheme, signature), _inner(scheme)
     for number, (domain, child, stencils) in enumerate(refined_children(scheme, [signature])[0]):
         fine = lattice_stencils(scheme, child)
@@ -138,7 +137,6 @@ def _irregular_signatures(scheme: Scheme) -> Iterator[Signature]:
 
 
 def _inner(scheme: Scheme) -> FloatArray:
-    """Return a few parameters inside the domain."""
     inner = 0.25 + 0.5 * scheme.domain.corners
     return inner[scheme.domain.inside(inner) > 0]
 

@@ -202,29 +202,6 @@ def clamped(domain: ParameterDomain, u: Float, v: Float) -> tuple[Float, Float]:
     return dr.clip(u - beyond, 0, 1), dr.clip(v - beyond, 0, 1)
 
 
-def in_child(domain: ParameterDomain, types: ArrayTypes, u: Float, v: Float) -> tuple[Index, Float, Float, Float]:
-    """Find the child domain that contains given parameters; not the first one if their extent is at least 0.5.
-
-    Returns its index in `ParameterDomain.children`; parameters in the child; and their derivatives by the given
-    parameters: 2, or -2 in the middle child of a triangle, which is rotated by 180 degrees.
-    """
-    right, upper = u >= 0.5, v >= 0.5
-    one, index = types.float(1), types.index
-    if domain.corner_count == 4:
-        number = dr.select(upper, dr.select(right, index(2), 3), dr.select(right, index(1), 0))
-        return number, 2 * u - dr.select(right, one, 0), 2 * v - dr.select(upper, one, 0), 2 * one
-    # Not both at the midpoint of the third side.
-    upper = upper & ~right
-    is_middle = ~(right | upper) & (u + v >= 0.5)
-    first_or_middle = dr.select(is_middle, index(3), index(0))
-    return (
-        dr.select(right, index(1), dr.select(upper, index(2), first_or_middle)),
-        dr.select(is_middle, one - 2 * u, 2 * u - dr.select(right, one, 0)),
-        dr.select(is_middle, one - 2 * v, 2 * v - dr.select(upper, one, 0)),
-        dr.select(is_middle, -2 * one, 2 * one),
-    )
-
-
 def doublings(
     types: ArrayTypes,
     x: Float,  # Detached here

@@ -40,7 +40,7 @@ from ..patches.piece_table import (
 )
 from .algebra import Monomials, added, combined, cross, like, selected
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Value, Vector3
-from .locations import ElementWalk, doublings, in_child, turn_matrix, turned
+from .locations import ElementWalk, doublings, turn_matrix, turned
 
 # Lower bound of the distance from an extraordinary point, in parameters of the tip, for computing its level: zero has
 # no exponent. No level is as deep as this.
@@ -353,7 +353,7 @@ class PieceKernel:
         """
         types = self.types
         is_whole = (row[CODE] & WHOLE) != 0
-        corner, inner_u, inner_v, inner_scale = in_child(self.domain, types, u, v)
+        corner, inner_u, inner_v, inner_scale = self._child_at(u, v)
         # Half-edges of an element are consecutive.
         given_corner = row[CODE] & CORNERS
         later_corner = (given_corner + corner) & 3
@@ -363,6 +363,10 @@ class PieceKernel:
         quarter_u, quarter_v = turned(self.domain, inner_u, inner_v, turn)
         u, v = dr.select(is_whole, quarter_u, u), dr.select(is_whole, quarter_v, v)
         return code, u, v, dr.select(is_whole, inner_scale, types.float(1)), turn
+
+    def _child_at(self, u: Float, v: Float) -> tuple[Index, Float, Float, Float]:
+        number, *inner = self.domain.child_at(u, v, dr.select)
+        return self.types.index(number), *inner
 
     def _leaf(
         self, node: Index, turn: Index, u: Float, v: Float, scale: Float, active: Mask
@@ -381,7 +385,7 @@ class PieceKernel:
         def descend(node, turn, u, v, scale):
             kind, first, _, _ = node_at(node)
             turn = (turn + kind // TURN) % count
-            number, inner_u, inner_v, inner_scale = in_child(self.domain, types, u, v)
+            number, inner_u, inner_v, inner_scale = self._child_at(u, v)
             # Children at corners are numbered from the first corner; the middle child of a triangle is the last.
             number = dr.select(number < count, (number + turn) % count, number)
             is_only = (kind & KINDS) == _ONLY_CHILD
@@ -414,7 +418,7 @@ class PieceKernel:
         max_level = dr.select(is_tip, level_count, types.index(0))
         level, power = doublings(types, dr.maximum(extent, LEAST_EXTENT), max_level)
         u, v, scale = u * power, v * power, scale * power
-        number, inner_u, inner_v, inner_scale = in_child(self.domain, types, u, v)
+        number, inner_u, inner_v, inner_scale = self._child_at(u, v)
         is_child = is_tip & (level < level_count)
         return (
             level,

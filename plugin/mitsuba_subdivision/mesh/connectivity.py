@@ -63,8 +63,7 @@ class SemiSharpness:
     ) -> SemiSharpness | None:
         """Return the sharpness including that after the next refinement; None if nothing is sharp.
 
-        A refinement lowers each sharpness by one. As in OpenSubdiv, Chaikin's method first replaces the sharpness of an
-        edge by 3/4 of it plus 1/4 of the mean of the other semi-sharp edges at the vertex [DeRose et al. 1998].
+        Section 11 of plugin/MATHEMATICS.md has the decay [DeRose et al. 1998].
         """
         if not (edges.any() or vertices.any() or across_sharpness.any()):
             return None
@@ -239,10 +238,7 @@ class Topology:
 
     @cached_property
     def edge_ends(self) -> IndexArray:
-        """``(n_e, 2)`` read-only ends of each edge, the lower vertex first; by the higher vertex, then the lower.
-
-        Edges between the same two vertices, which occur in non-manifold meshes, are one edge.
-        """
+        """``(n_e, 2)`` read-only ends of different edges, the lower first; by the higher vertex, then the lower."""
         start, end = self.face_vertices.astype(np.int64), self.face_vertices[self.next]
         keys = np.unique(np.maximum(start, end) * self.vertex_count + np.minimum(start, end))
         ends = np.stack(np.divmod(keys, self.vertex_count)[::-1], axis=1).astype(np.int32)
@@ -314,10 +310,7 @@ class Topology:
 
     @cached_property
     def vertex_fans(self) -> tuple[IntArray, IndexArray]:
-        """Offsets ``(n_v + 1,)``, and outgoing half-edges of every inner vertex, counter-clockwise from its lowest.
-
-        Half-edges of vertex ``v`` are ``offsets[v]`` up to ``offsets[v + 1]``; border vertices have none.
-        """
+        """Offsets ``(n_v + 1,)``, and outgoing half-edges of every inner vertex, counter-clockwise from its lowest."""
         counts = np.where(self.is_border_vertex, 0, self.vertex_face_count)
         offsets = ragged.offsets(counts)
         half_edges = np.empty(offsets[-1], dtype=np.int32)
@@ -343,6 +336,13 @@ class Topology:
         is_past = rows >= np.repeat(self.face_offsets[1:][face], counts)
         return rows - is_past * np.repeat(self.face_sizes[face], counts)
 
+    def around_faces(self, half_edges: IntArray, count: int) -> list[IntArray]:
+        """Return half-edges, and for each the ``count - 1`` following ones of its face, one after the other."""
+        around = [half_edges]
+        for _ in range(count - 1):
+            around.append(self.next.take(around[-1]))
+        return around
+
     def half_edges_of(self, is_chosen: NDArray[np.bool_]) -> IntArray:
         """Return the half-edges of the faces selected by ``is_chosen``, in ascending order."""
         return np.flatnonzero(np.repeat(is_chosen, self.common_size or self.face_sizes))
@@ -351,10 +351,9 @@ class Topology:
 def paired(
     keys: IntArray,  # (n,) int: number of each half-edge, from 0, equal for half-edges of the same edge only
 ) -> tuple[IndexArray, IndexArray, int]:
-    """Join half-edges of equal keys into edges.
+    """Return the edge ``(n,)`` of each half-edge, in the order of keys, its twin ``(n,)``, and the number of edges.
 
-    Returns (n,) int32, the 0-based edge of each half-edge, in the order of the keys; (n,) int32, the other half-edge of
-    the edge, -1 if there is none, and one of them if the edge has more than two; and the number of edges.
+    A twin is -1 where the edge has no other half-edge, and one of them where it has more than two.
     """
     order, begins = sorted_order(keys)
     edge, twin = np.empty_like(order), np.full_like(order, -1)

@@ -146,8 +146,7 @@ _SHARED: Shared[SharpMesh] = Shared()
 def _vertex_rules(mesh: SharpMesh, is_cut: NDArray[np.bool_], is_border: NDArray[np.bool_]) -> NDArray[np.int8]:
     """Return ``(n_v,)`` the `VertexRule` of each vertex, from its number of sharp edges and border edges.
 
-    A vertex without such edges is smooth. With one edge it is a dart, where a crease ends and the faces stay connected.
-    With two edges it is on a crease, and with more it is a corner. Smooth and crease vertices have the automatic rule.
+    With one it is a dart, with more than two a corner; smooth and crease vertices have the automatic rule.
     """
     t = mesh.topology
     rules = np.full(t.vertex_count, VertexRule.AUTOMATIC, dtype=np.int8)
@@ -168,10 +167,7 @@ def _split_vertices(
     mesh: SharpMesh,
     is_border: NDArray[np.bool_],  # (n_h,) bool: whether each half-edge lies on a border after the cut
 ) -> tuple[NDArray[np.int32], IntArray]:
-    """Create a copy of a vertex for each of its sides, see `CutMesh`.
-
-    Returns ``face_vertices`` of the cut mesh, (n_h,) int32, and `CutMesh.vertex`.
-    """
+    """Create a copy of a vertex for each of its sides: ``face_vertices`` of the cut mesh, and `CutMesh.vertex`."""
     t = mesh.topology
     # Counter-clockwise, a side begins at an outgoing border edge. A closed fan is a side, too, if the vertex has other
     # fans.
@@ -248,10 +244,7 @@ def semi_sharpness_of_cut(
 
 
 def seams(topology: Topology, indices: IntArray) -> NDArray[np.bool_]:
-    """Return ``(n_h,)``: whether each half-edge is on a seam: its faces have different indices at an end of the edge.
-
-    As in OpenSubdiv, indices are compared, not their values.
-    """
+    """Return ``(n_h,)``: whether the faces beside each half-edge have different indices, not values, at an end."""
     t = topology
     inside = np.flatnonzero(t.twin >= 0)
     twin = t.twin[inside]
@@ -273,20 +266,16 @@ def value_mesh(
 ) -> tuple[Topology, IntArray]:
     """Return the mesh on which face-varying values are subdivided, in every mode except "all".
 
-    The rules are those of OpenSubdiv 3.5. An edge is a seam as a whole, even if its sides have the same index at one
-    end. At a vertex without a seam the values follow the rule of the vertex on the surface: crease, dart or corner. At
-    a vertex with a seam each index has a separate rule: that of a corner under the conditions of section 12 of
-    plugin/MATHEMATICS.md, otherwise that of a border.
+    The rules are those of OpenSubdiv 3.5: section 12 of plugin/MATHEMATICS.md. An edge is a seam as a whole, even if
+    its sides have the same index at one end. At a vertex without a seam the values follow its rule on the surface.
 
     A semi-sharp vertex, or semi-sharp edges between the faces of an index, make the index a corner until they have
-    decayed. In "corners_plus1" and "corners_plus2", if a vertex has two indices, the
-    semi-sharp edges of one also make the other a corner, if the other has no semi-sharp edges. Semi-sharp edges on a
-    seam, and other edges across a seam, have no influence.
+    decayed. In "corners_plus1" and "corners_plus2", semi-sharp edges of one of two indices also make the other a
+    corner, if it has none. Semi-sharp edges on a seam, and other edges across a seam, have no influence.
 
     Where a seam ends inside the mesh without a corner, it is a border up to its end; the neighbours of the end on the
     border are the values on the two sides of the seam. At boundary vertices without a seam, mode "boundaries" has
-    corners; the other modes except "none" have corners at vertices with one face, for every boundary rule. An edge with
-    corners at both ends is interpolated linearly.
+    corners; the other modes except "none" have corners at vertices with one face, for every boundary rule.
 
     There are two differences from OpenSubdiv 3.5. Where two indices alternate around a vertex (A B A B), OpenSubdiv
     counts the second index twice, and may treat its two parts as unrelated; here both indices are corners. Where
@@ -352,10 +341,7 @@ def _vary(group: IntArray, values: IntArray) -> NDArray[np.bool_]:
 def _rules_at_seams(
     mesh: SharpMesh, mode: str, vertex: IntArray, value_index: IntArray, face_count: IntArray
 ) -> NDArray[np.int8]:
-    """Return ``(c,)`` rules of copies of vertices, given each copy's vertex, value and number of faces.
-
-    All copies of a vertex with the same value have the same rule, see `value_mesh`.
-    """
+    """Return ``(c,)`` rules of copies of vertices, which are equal for those of equal vertex and value."""
     # Pairs encoded as one number are sorted several times faster.
     value_count = int(value_index.max(initial=0)) + 1
     pairs, value_of = np.unique(vertex * value_count + value_index, return_inverse=True)

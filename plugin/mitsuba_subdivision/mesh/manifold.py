@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .connectivity import IntArray, Topology
 from .ragged import sorted_order
 
-# Maximum number of corners of faces that are checked without sorting.
+# Most corners of faces, all of one size, whose vertices are compared without sorting.
 FEW_CORNERS = 8
 
 
@@ -42,22 +42,17 @@ class NonManifold:
 
 def is_manifold(topology: Topology) -> bool:
     """Return whether a mesh is an oriented manifold, and no face has a vertex twice."""
-    t = topology
-    if not _corners_differ(t):
+    t, size = topology, topology.common_size
+    if 0 < size <= FEW_CORNERS:
+        corners = t.face_vertices.reshape(-1, size).T
+        if any((corners[i] == corners[j]).any() for i in range(size) for j in range(i)):
+            return False
+    elif is_repeated(t).any():
         return False
     # An edge with twins accounts for two half-edges, an edge without for one.
     if 2 * t.edge_count - np.count_nonzero(t.twin < 0) != t.half_edge_count:
         return False
     return not runs_with_twin(t).any() and _has_single_fans(t)
-
-
-def _corners_differ(topology: Topology) -> bool:
-    """Return whether no face has a vertex twice. Small faces of a common size are checked without sorting."""
-    size = topology.common_size
-    if not 0 < size <= FEW_CORNERS:
-        return not is_repeated(topology).any()
-    corners = topology.face_vertices.reshape(-1, size).T
-    return not any((corners[i] == corners[j]).any() for i in range(size) for j in range(i))
 
 
 def is_repeated(topology: Topology) -> NDArray[np.bool_]:
@@ -82,10 +77,7 @@ def runs_with_twin(topology: Topology) -> NDArray[np.bool_]:
 
 
 def _has_single_fans(topology: Topology) -> bool:
-    """Return whether the faces of each vertex form one fan.
-
-    Walks around all vertices simultaneously. A fan must end after as many faces as its vertex has, and not before.
-    """
+    """Return whether the faces of each vertex form one fan, which ends after as many faces as the vertex has."""
     t = topology
     count = t.vertex_face_count
     start = np.where(t.open_fan_start < 0, t.vertex_half_edge, t.open_fan_start)[count > 0]
@@ -101,10 +93,9 @@ def _has_single_fans(topology: Topology) -> bool:
 
 
 def fan_labels(topology: Topology) -> tuple[IntArray, NDArray[np.bool_]]:
-    """Label the fan of each face corner: ``(n_h,)`` a label that is equal for corners of one fan only.
+    """Return ``(n_h,)`` labels, equal for corners of one fan only, and ``(n_h,)``, true at one corner of each fan.
 
-    Also returns ``(n_h,)``, true at one corner of each fan. Uses pointer doubling: after ``r`` rounds each corner
-    covers the next ``2**r`` corners counter-clockwise.
+    Uses pointer doubling: after ``r`` rounds each corner covers the next ``2**r`` corners counter-clockwise.
     """
     corners = np.arange(topology.half_edge_count)
     jump = topology.turn.copy()
@@ -165,14 +156,11 @@ def separated(topology: Topology) -> tuple[Topology, NonManifold | None]:
 
 
 def turning_order(topology: Topology) -> IntArray | None:
-    """Find an order of the face corners with consistent winding; None if the winding is already consistent.
+    """Find an order ``(n_h,)`` of the face corners with consistent winding; None if it is already consistent.
 
     Two faces are neighbours if they share an edge that no third face has. In each connected component the smaller part
     is turned over; of two equal parts, the one without the component's lowest face. A turned face keeps its first
-    corner. Faces around a Möbius strip have no consistent winding; there as few pairs of neighbours as possible remain
-    inconsistent.
-
-    Returns (n_h,) int64: the present index of each corner of the new order.
+    corner. Where there is no consistent winding, as on a Möbius strip, as few neighbours as possible are inconsistent.
     """
     t = topology
     one = np.flatnonzero((t.twin > np.arange(t.half_edge_count)) & (np.bincount(t.edge)[t.edge] == 2))

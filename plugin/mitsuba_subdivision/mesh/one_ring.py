@@ -127,9 +127,7 @@ class RingTable:
             columns = vertices[slice(*entries)].reshape(ring.vertex_count, -1)
             half_edges, count = self.half_edges[slice(*elements)], len(ring.around)
             for part in ragged.chunks_of(len(half_edges), 8):
-                corners = [half_edges[part]]
-                for _ in range(count - 1):
-                    corners.append(t.next.take(corners[-1]))
+                corners = t.around_faces(half_edges[part], count)
                 t.face_vertices.take(corners, out=columns[:count, part], mode="clip")
                 starts = surroundings.start.take(corners)
                 index = starts.take(ring.corner[count:], axis=0) + ring.offset[count:, None]
@@ -270,10 +268,8 @@ def _equal_half_edges(apart: Topology, one: IntArray, other: IntArray) -> tuple[
     """Make pairs of half-edges twins, in a mesh of separate faces.
 
     If a half-edge is to be the twin of two, the two are the same half-edge, and their faces are the same face. Then
-    their twins are the same, too. Sets of equal half-edges are represented by their lowest member.
-
-    Returns ``(n_h,)`` the lowest half-edge that is equal to each one; and the twin of each that is the lowest, ``n_h``
-    for none.
+    their twins are the same, too. Returns ``(n_h,)`` the lowest half-edge that is equal to each one; and the twins of
+    these, ``n_h`` for none.
     """
     count, face, begin = apart.half_edge_count, apart.face, apart.face_offsets
     index = np.arange(count) - begin[face]
@@ -302,16 +298,12 @@ def _equal_half_edges(apart: Topology, one: IntArray, other: IntArray) -> tuple[
 def joined_rings(signatures: Sequence[Signature]) -> tuple[Topology, IntArray, IntArray]:
     """Join the one-rings of r signatures, with their semi-sharp features, to one mesh.
 
-    Returns the mesh; ``(r,)`` half-edge 0 of each ring, which names its element; and ``(r + 1,)`` offsets of vertices:
-    those of ring ``i`` are ``offsets[i]`` up to ``offsets[i + 1]``.
+    Also returns ``(r,)`` half-edge 0 of each ring, which names its element, and ``(r + 1,)`` offsets of its vertices.
     """
     rings = one_rings(signatures)
     parts = [ring.topology for ring in rings]
-    half_edges, vertices = (
-        ragged.offsets(counts)
-        for counts in ([part.half_edge_count for part in parts], [part.vertex_count for part in parts])
-    )
-    counts = np.diff(half_edges)
+    counts = [part.half_edge_count for part in parts]
+    half_edges, vertices = ragged.offsets(counts), ragged.offsets([part.vertex_count for part in parts])
     topology = Topology(
         int(vertices[-1]),
         np.concatenate([part.face_sizes for part in parts]),
@@ -334,11 +326,7 @@ def _semi_sharpness(
     topology: Topology,
     fans: list[tuple[Fan, IntArray]],  # Semi-sharp fans, and their half-edges from the most clockwise one on
 ) -> SemiSharpness:
-    """Return the semi-sharp features at the corners of elements.
-
-    Of the features elsewhere in a one-ring, only the refined sharpness at the far ends of the edges at the corners
-    affects the element.
-    """
+    """Return the semi-sharp features at the corners of elements: of all others, only far ends of edges matter."""
     edges, refined = np.zeros((2, topology.half_edge_count))
     vertices = np.zeros(topology.vertex_count)
     half_edges = np.concatenate([around for _, around in fans])

@@ -55,10 +55,7 @@ def ranges(first: IntArray, lengths: IntArray) -> NDArray[np.int64]:
 
 
 def chunks_of(count: int, parts: int = 1) -> Iterator[slice]:
-    """Yield successive slices of ``count`` entries, to bound temporary memory.
-
-    Slices are ``parts`` times shorter, for entries of as many parts.
-    """
+    """Yield successive slices of ``count`` entries of so many ``parts``, to bound temporary memory."""
     length = max(1, CHUNK_LENGTH // parts)
     for begin in range(0, count, length):
         yield slice(begin, min(begin + length, count))

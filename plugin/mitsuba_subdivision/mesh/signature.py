@@ -34,10 +34,7 @@ FEW_CODES = 1 << 16
 
 
 class Fan(NamedTuple):
-    """Faces around a vertex, in order from one face, the first, and the semi-sharp features there.
-
-    It has no indices of vertices and edges, so that equal surroundings have equal fans.
-    """
+    """Faces around a vertex, in order from one face, the first, and semi-sharp features; no indices, to be compared."""
 
     ahead: tuple[int, ...]  # Sizes of the faces from the first on, counter-clockwise up to the border, or all around
     # Sizes of the other faces, clockwise from the first up to the border; None if the faces go all around
@@ -57,11 +54,6 @@ class Fan(NamedTuple):
         return self.behind is None
 
     @property
-    def is_open(self) -> bool:
-        """Whether the faces lie between two borders. A dart is not open: faces on both sides of its crease interact."""
-        return not self.is_closed and self.rule != VertexRule.DART
-
-    @property
     def is_inside(self) -> bool:
         """Whether the vertex is smooth and inside the mesh."""
         return self.is_closed and self.rule == VertexRule.AUTOMATIC and not self.is_semi_sharp
@@ -74,23 +66,15 @@ class Fan(NamedTuple):
     def face_count(self) -> int:
         return len(self.ahead) + len(self.behind or ())
 
-    @property
-    def turns(self) -> range:
-        """Number of turns about the vertex from the first face to each face; positive counter-clockwise."""
-        return range(-len(self.behind or ()), len(self.ahead))
-
-    def size(self, turns: int) -> int:
-        """Return the size of the face at a number of turns from the first face."""
-        return self.ahead[turns] if turns >= 0 or self.behind is None else self.behind[-1 - turns]
-
     def near(self) -> Fan:
         """Return the fan without faces whose influence on the first face is negligible.
 
-        The vertex of an open fan depends on its two border neighbours only. A face influences only its neighbours at
-        each refinement, with a small weight. So a large fan is reduced to the `NEAR_FACES` around the first face; its
-        outermost neighbours remain those on the borders (`OneRing.open_fans`).
+        A large open fan is reduced to the `NEAR_FACES` around the first face, see section 6 of plugin/MATHEMATICS.md;
+        its outermost neighbours remain those on the borders (`OneRing.open_fans`).
         """
-        if not self.is_open or self.behind is None or self.is_semi_sharp or self.face_count <= NEAR_FACES:
+        # At a dart, faces on both sides of its crease interact.
+        is_dart = self.rule == VertexRule.DART
+        if self.behind is None or is_dart or self.is_semi_sharp or self.face_count <= NEAR_FACES:
             return self
         behind = near_behind(len(self.ahead), len(self.behind))
         return self._replace(ahead=self.ahead[: NEAR_FACES - behind], behind=self.behind[:behind])
@@ -107,10 +91,7 @@ def near_behind(ahead: Number, behind: Number) -> Number:
 
 @dataclass(frozen=True)
 class Signature:
-    """Shape of a one-ring, in the order that the half-edge of the element determines.
-
-    Elements with equal signatures have the same limit stencils over their one-rings.
-    """
+    """Shape of a one-ring, from the half-edge of the element on. Equal signatures have the same limit stencils."""
 
     kind: ElementKind
     # For a face, the fans at its corners, counter-clockwise, each with the element as the first face. For a vertex, its
@@ -145,11 +126,6 @@ class Signature:
             raise TypeError("a vertex on a border; expected one amid faces, as another has a first and a last face")
         ahead = fan.ahead[corner:] + fan.ahead[:corner]
         return Signature("vertex", (fan._replace(ahead=ahead, edges=fan.edges[corner:] + fan.edges[:corner]),))
-
-
-def signature_at(topology: Topology, half_edge: int, kind: ElementKind) -> Signature:
-    """Return the signature of one element."""
-    return signatures_at(topology, np.array([half_edge]), kind)[0]
 
 
 def signatures_at(
@@ -213,7 +189,10 @@ def fan_codes(
 ) -> IntArray:
     """``(n_h,)`` code of the fan around the vertex at which each half-edge begins, seen from the half-edge's face."""
     t = topology
-    far_vertices = _has_far_faces(t) if near else np.zeros(0, dtype=bool)
+    # Vertices at which `Fan.near` leaves out faces
+    far_vertices = t.is_border_vertex & (t.vertex_face_count > NEAR_FACES) & near
+    if far_vertices.any():
+        far_vertices &= (t.vertex_rules != VertexRule.DART) & ~t.is_semi_sharp_vertex
     face_count = np.where(far_vertices, NEAR_FACES, t.vertex_face_count) if far_vertices.any() else t.vertex_face_count
     columns, cut = [row_codes([face_count, _vertex_codes(t)])[t.face_vertices]], None
     if t.is_border_vertex.any():
@@ -233,10 +212,7 @@ def fan_codes(
 def row_codes(
     columns: Sequence[IntArray],  # sequence of (n,) int: the first column counts most in the order
 ) -> IntArray:
-    """Number the rows of a table: equal rows get equal codes, in lexicographic order.
-
-    Returns (n,) unsigned integers of a type of few bytes, where these suffice.
-    """
+    """Number the rows of a table in lexicographic order, equal rows alike, by unsigned integers of few bytes."""
     codes: IntArray = np.zeros(len(columns[0]), dtype=np.uint8)
     count = 1
     for column in columns:
@@ -296,13 +272,6 @@ def _faces_clockwise(topology: Topology) -> IntArray:
     return behind
 
 
-def _has_far_faces(topology: Topology) -> NDArray[np.bool_]:
-    """``(n_v,)`` whether `Fan.near` leaves out faces of the fan around each vertex."""
-    t = topology
-    is_large = t.is_border_vertex & (t.vertex_face_count > NEAR_FACES)
-    return is_large & (t.vertex_rules != VertexRule.DART) & ~t.is_semi_sharp_vertex if is_large.any() else is_large
-
-
 def _codes_around(
     topology: Topology,
     face_codes: IntArray,  # (n_h,) int: code of each half-edge's face
@@ -313,9 +282,8 @@ def _codes_around(
 ) -> tuple[IntArray, IntArray]:
     """Two columns that encode the sequence of faces around the vertex of each half-edge.
 
-    Around a vertex whose faces all have the same code, the first column is that code, and the second is 0. Around any
-    other, the first column is 0, and the second is a code, from 1 on, of the sequence of face codes, counter-clockwise
-    from the half-edge's face.
+    Where all faces have the same code, that code, and 0. Elsewhere 0, and a code, from 1 on, of the sequence of face
+    codes, counter-clockwise from the half-edge's face.
     """
     t = topology
     common, sequence = face_codes.astype(np.int64), np.zeros(t.half_edge_count, dtype=np.int64)

@@ -17,13 +17,11 @@ def triangle_corners(
     face_sizes: IntArray,  # (n_f,)
     face_vertices: IntArray,  # (n_h,)
 ) -> tuple[IntArray, IntArray]:
-    """Triangulate polygons, convex or not.
+    """Return corners ``(n, 3)`` of triangles of polygons, 0-based in ``face_vertices``, and the face of each, in order.
 
     Most polygons become a fan at their first corner. Where that would leave the polygon, as at a notch or at a cut to
     a hole, quadrilaterals are split at the other diagonal, and larger polygons are clipped ear by ear in their mean
     plane. Triangles have the orientation of their polygon. Polygons without a mean plane become fans.
-
-    Returns corners ``(n, 3)`` of the triangles, 0-based in ``face_vertices``, and ``(n,)`` the face of each, in order.
     """
     counts = np.maximum(face_sizes - 2, 0)
     first, face = ragged.starts(face_sizes), np.repeat(np.arange(len(face_sizes)), counts)

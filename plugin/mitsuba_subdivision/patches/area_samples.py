@@ -36,10 +36,7 @@ TIP_LEVELS = 2
 
 
 def surface_areas(pieces: SurfacePieces) -> tuple[list[FloatArray], float]:
-    """Measure a surface.
-
-    Returns the areas of the pieces of `SurfacePieces.parts` for `level_count`, and of all that is beyond these levels.
-    """
+    """Areas of the pieces of `SurfacePieces.parts` for `level_count`, and of all that is beyond these levels."""
     first_parts = pieces.parts(lambda _: 1)
     rough = sum(float(_measured(part(), ORDERS[0])[1].sum()) for part in first_parts)
     count = len(pieces.regular) + sum(3 * level_count(tips) * len(tips) for tips in pieces.tips)
@@ -90,7 +87,6 @@ def level_count(tips: Tips) -> int:
 
 
 def _measured(pieces: PolynomialPieces, orders: tuple[int, int]) -> FloatArray:
-    """``(2, n)`` areas by Gauss rules of the two orders."""
     (coarse, coarse_weights), (fine, fine_weights) = (pieces.basis.domain.quadrature(order) for order in orders)
     weights = np.zeros((2, len(coarse) + len(fine)))
     weights[0, : len(coarse)], weights[1, len(coarse) :] = coarse_weights, fine_weights
@@ -102,11 +98,7 @@ def _measured(pieces: PolynomialPieces, orders: tuple[int, int]) -> FloatArray:
 
 
 def largest_area_elements(pieces: PolynomialPieces) -> FloatArray:
-    """``(n,)`` upper bounds of the area elements of each piece.
-
-    The cross product of the derivatives is a polynomial, whose length is at most that of its longest Bernstein
-    coefficient.
-    """
+    """``(n,)`` upper bounds of area elements: the longest Bernstein coefficient of the derivatives' cross product."""
     basis = BernsteinBasis(pieces.basis.domain, 2 * pieces.basis.degree)
     values = pieces.basis.values(basis.indices / basis.degree)
     bounds = np.empty(len(pieces))
@@ -145,14 +137,11 @@ def uniform_locations(
     count: int,
     rng: np.random.Generator,
 ) -> tuple[NDArray[np.int64], FloatArray]:
-    """Draw random locations on a surface, uniform by area.
+    """Draw half-edges of `PatchTable.elements` and parameters ``(count, 2)`` from there, uniform by area.
 
     A piece is chosen with a probability proportional to its area. Within the piece, rejection sampling accepts uniform
     parameters with the ratio of the area element to its bound. The levels around extraordinary points that are not
     measured, about 1e-11 of the surface, are left out.
-
-    Returns ``half_edge``, (count,) int64: the corner of an element at which parameters start, a half-edge of
-    `PatchTable.elements`; and ``uv``, (count, 2) float64.
     """
     cumulative = np.cumsum(np.concatenate(areas))
     chosen = np.searchsorted(cumulative, rng.random(count) * cumulative[-1], side="right")
@@ -170,7 +159,6 @@ def uniform_locations(
 
 
 def _uniform_in_pieces(pieces: PolynomialPieces, which: IntArray, rng: np.random.Generator) -> FloatArray:
-    """``(s, 2)`` parameters in pieces, uniform by area, by rejection sampling."""
     bound = BOUND_ROUNDED * largest_area_elements(pieces)
     accepted_uv, left = np.empty((len(which), 2)), np.arange(len(which))
     while len(left):

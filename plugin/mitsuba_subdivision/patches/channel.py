@@ -84,8 +84,8 @@ class Channel:
     def weights(self, half_edge: IntArray, uv: FloatArray) -> sparse.csr_array:
         """``(s, n)`` weights of the values at samples; rows sum to one."""
         if not self.layout.is_linear:
-            indices = self.layout.value_index, len(self.values)
-            return stencil_matrices(self.layout.patches, *indices, half_edge, uv, limit_stencils, 1)[0]
+            patches, values = self.layout.patches, (self.layout.value_index, len(self.values))
+            return stencil_matrices(patches, half_edge, uv, limit_stencils, 1, *values)[0]
         from scipy import sparse
 
         rows, (weights, *_) = self._linear_terms(half_edge, uv)
@@ -133,9 +133,7 @@ class Channel:
     def _linear_terms(self, half_edge: IntArray, uv: FloatArray) -> tuple[IntArray, FloatArray]:
         """Rows ``(s, m)`` of `with_centres`, and their weights ``(3, s, m)`` in values and derivatives by u and v."""
         t, domain = self.layout.patches.topology, self.layout.patches.scheme.domain
-        corners = [self.layout.patches.half_edge_of_corner[half_edge]]
-        for _ in range(domain.corner_count - 2):
-            corners.append(t.next[corners[-1]])
+        corners = t.around_faces(self.layout.patches.half_edge_of_corner[half_edge], domain.corner_count - 1)
         rows = self.layout.value_index[np.stack([*corners, t.prev[corners[0]]], axis=1)]
         weights = np.array([domain.corner_weights(*uv.T), *domain.corner_derivatives(*uv.T)]).swapaxes(1, 2)
         face = t.face[corners[0]]
@@ -155,10 +153,7 @@ def contracts_alike(
     patches: PatchTable,  # Of the surface
     half_edge: IntArray,  # (s,) int64: half-edges that begin at the points
 ) -> NDArray[np.bool_]:
-    """``(s,)`` whether a channel's values are subdivided as the surface's points are, around extraordinary points.
-
-    If so, tangents of the values and of the points are the same multiples of derivatives nearby.
-    """
+    """``(s,)`` whether values are subdivided as points are, so that tangents are the same multiples of derivatives."""
     if channel.layout.is_linear:
         return np.zeros(len(half_edge), dtype=bool)
     if channel.layout.patches is patches:
@@ -210,8 +205,7 @@ def _is_cut_into_faces(cage: ControlCage, scheme: Scheme, lies_on_seam: NDArray[
 @lru_cache(maxsize=32)
 def _is_linear_alone(scheme: Scheme) -> bool:
     """Whether a scheme's surface over a single element with sharp corners is linear interpolation."""
-    count = scheme.domain.corner_count
-    corners = np.arange(count, dtype=np.int32)
+    count, corners = scheme.domain.corner_count, np.arange(scheme.domain.corner_count, dtype=np.int32)
     rules = np.full(count, VertexRule.CORNER, dtype=np.int8)
     patches = PatchTable(Topology(count, np.array([count]), corners, rules=rules), scheme)
     uv = np.array([(0.1, 0.2), (0.5, 0.25), (0.3, 0.6)])

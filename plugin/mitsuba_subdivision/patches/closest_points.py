@@ -73,8 +73,12 @@ class ClosestPointSearch:
     def __init__(self, pieces: SurfacePieces) -> None:
         from scipy.spatial import cKDTree
 
-        self._tips, self._first_levels = pieces.tips, _first_levels(pieces)
-        parts = [pieces.regular]
+        self._tips, parts = pieces.tips, [pieces.regular]
+        # For each of the tips, the first level whose pieces are not kept, but computed when a query needs them.
+        most = max((tips.bounded_levels for tips in self._tips), default=0)
+        per_level = sum(3 * len(tips) for tips in self._tips)
+        kept = min(most, max(MOST_KEPT - len(pieces.regular), 0) // max(per_level, 1))
+        self._first_levels = [min(kept, tips.bounded_levels) for tips in self._tips]
         for tips, first_level in zip(self._tips, self._first_levels, strict=True):
             parts += [tips.level(level) for level in range(first_level)]
         self._size = float(pieces.sizes.max())
@@ -91,11 +95,7 @@ class ClosestPointSearch:
         self._known: cKDTree = cKDTree(points)
 
     def nearest(self, points: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-        """Locate the nearest points of the surface to ``(s, 3)`` points.
-
-        Returns ``half_edge``, (s,) int64: the corner of an element at which parameters start, a half-edge of
-        `PatchTable.elements`; and ``uv``, (s, 2) float64.
-        """
+        """Locate the nearest points of the surface to ``(s, 3)`` points, as half-edges and parameters."""
         locations = [self._nearest(run) for run in np.split(points, range(CHUNK, len(points), CHUNK))]
         half_edge, uv = zip(*locations, strict=True)
         return np.concatenate(half_edge), np.concatenate(uv)
@@ -119,10 +119,7 @@ class ClosestPointSearch:
 
 
 class _Best:
-    """The nearest locations found so far for the points of a query.
-
-    The methods take pairs of a point and a piece (tip, part) as two index arrays.
-    """
+    """The nearest locations found so far; pairs of a point and a piece (tip, part) are two index arrays."""
 
     def __init__(
         self,
@@ -220,11 +217,7 @@ class _Best:
     def _take(
         self, point: IntArray, squared: FloatArray, slope: FloatArray, half_edge: IntArray, uv: FloatArray
     ) -> None:
-        """Take over nearer locations; among equally near ones, the one with the least slope.
-
-        Adjacent pieces share the points of their edge. If the nearest point is just beside the edge, a point on the
-        edge may be equally near up to rounding.
-        """
+        """Take over nearer locations; among equally near ones, as on edges of adjacent pieces, of the least slope."""
         least = self._squared_distance.copy()
         np.minimum.at(least, point, squared)
         limit = least + self._rounded(least)
@@ -237,14 +230,6 @@ class _Best:
         updated = point[candidates]
         self._squared_distance[updated], self._slope[updated] = squared[candidates], slope[candidates]
         self.half_edge[updated], self.uv[updated] = half_edge[candidates], uv[candidates]
-
-
-def _first_levels(pieces: SurfacePieces) -> list[int]:
-    """For each of the tips, the first level whose pieces are not kept, but computed when a query needs them."""
-    most = max((tips.bounded_levels for tips in pieces.tips), default=0)
-    per_level = sum(3 * len(tips) for tips in pieces.tips)
-    kept = min(most, max(MOST_KEPT - len(pieces.regular), 0) // max(per_level, 1))
-    return [min(kept, tips.bounded_levels) for tips in pieces.tips]
 
 
 def _flat_pieces(pieces: PolynomialPieces, rounded: float) -> tuple[PolynomialPieces, TurnedBoxes]:
@@ -270,7 +255,6 @@ class BoxTree:
 
     @classmethod
     def build(cls, lower: FloatArray, upper: FloatArray) -> BoxTree:
-        """Build the hierarchy of boxes with corners ``(n, 3)``, at least one."""
         from scipy.spatial import cKDTree
 
         order = cKDTree((lower + upper) / 2, leafsize=WIDTH).indices

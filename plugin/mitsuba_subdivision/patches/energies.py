@@ -8,7 +8,7 @@ the metric differs.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +17,6 @@ from ..evaluation.eigenbasis import CLUSTER_WIDTH
 from ..evaluation.irregular_patch import IrregularPatch, level_rows
 from ..evaluation.patch_tree import patch_trees
 from ..evaluation.polynomials import polynomial_basis
-from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature
 from ..messages import counted
 from ..schemes.domain import FloatArray
@@ -40,7 +39,6 @@ Density = Callable[[FloatArray, FloatArray], FloatArray]
 
 def energy_matrix(
     patches: PatchTable,
-    control_of_vertex: IntArray,  # (n_v,) int64: 0-based control point at each mesh vertex
     control_points: FloatArray,  # (n, 3) float64
     density: Density,
     order: int,  # Gauss nodes along each parameter of a piece
@@ -48,8 +46,8 @@ def energy_matrix(
     """Integrate an energy over a surface. Returns a symmetric (n, n) CSR array of float64."""
     from scipy import sparse
 
-    controls, refinement = patches.control_rows(control_of_vertex, len(control_points))
-    table = patches if patches.refined is None else patches.refined.table
+    controls, refinement = patches.control_rows()
+    table = patches.evaluated
     points = control_points if refinement is None else refinement @ control_points
     total = sparse.csr_array((len(points), len(points)))
     for patch_class in counted(table.classes, "Energies of patch classes"):
@@ -92,10 +90,9 @@ def _basis_derivatives(
 def _level_count(patch: IrregularPatch, density: Density) -> int:
     """Number of levels around an extraordinary point over which an energy is summed.
 
-    From level to level, areas scale with the product of the second and third eigenvalues, and so does the energy of
-    first derivatives. Second derivatives scale at most with the fourth eigenvalue over the square of the third. They
-    are square integrable at smooth vertices [Reif and Schröder 2001]. Where they are not, only the first level is
-    summed.
+    From level to level, areas, and the energy of first derivatives, scale with the product of the second and third
+    eigenvalues; second derivatives at most with the fourth over the square of the third. Where these are not square
+    integrable, as they are at smooth vertices [Reif and Schröder 2001], only the first level is summed.
     """
     _, second, third, fourth, *_ = patch.basis.moduli
     ratio = second * third if density is gradients else (fourth / third**2) ** 2 * second * third
@@ -107,15 +104,14 @@ def gradients(basis: FloatArray, points: FloatArray) -> FloatArray:
     """`Density` of the Dirichlet energy: ``(P, S, 2, K)`` gradients of basis functions in an orthonormal frame."""
     (a, b, c), area = _frames(points)
     root = np.sqrt(area)
-    return np.stack([_sum((a * root, basis[0])), _sum((b * root, basis[0]), (c * root, basis[1]))], axis=2)
+    return np.stack([_sum([a * root, 0 * a], basis[:2]), _sum([b * root, c * root], basis[:2])], axis=2)
 
 
 def hessians(basis: FloatArray, points: FloatArray) -> FloatArray:
     """`Density` of the bending energy: ``(P, S, 3, K)`` covariant Hessians of basis functions in an orthonormal frame.
 
-    The entries are 11, 12 and 22. Entry 12 is multiplied by the square root of two, so that the sum of squares is that
-    of all four entries of the symmetric matrix. Christoffel symbols are the tangential components of the second
-    derivatives of the points.
+    Entries 11, 12, times the square root of two as it occurs twice, and 22. Christoffel symbols are the tangential
+    components of the second derivatives of the points.
     """
     (a, b, c), area = _frames(points)
     du, dv = points[:2]
@@ -130,26 +126,17 @@ def hessians(basis: FloatArray, points: FloatArray) -> FloatArray:
         root * np.sqrt(2) * np.stack([a * b, a * c, 0 * a]),
         root * np.stack([b * b, 2 * b * c, c * c]),
     )
-    hessian = []
-    for entry in entries:
-        tangential = ((entry * by_u).sum(axis=0), basis[0]), ((entry * by_v).sum(axis=0), basis[1])
-        hessian.append(_sum(*zip(entry, basis[2:], strict=True)) - _sum(*tangential))
-    return np.stack(hessian, axis=2)
+    tangential = ((-(entry * by_u).sum(axis=0), -(entry * by_v).sum(axis=0)) for entry in entries)
+    return np.stack([_sum([*of_first, *e], basis) for of_first, e in zip(tangential, entries, strict=True)], axis=2)
 
 
-def _sum(*terms: tuple[FloatArray, FloatArray]) -> FloatArray:
+def _sum(factors: Sequence[FloatArray], weights: FloatArray) -> FloatArray:
     """``(P, S, K)`` sum of factors ``(P, S)`` times weights ``(S, K)``."""
-    total = terms[0][0][..., None] * terms[0][1]
-    for factor, weights in terms[1:]:
-        total += factor[..., None] * weights
-    return total
+    return (np.stack(factors).T @ weights.swapaxes(0, 1)).swapaxes(0, 1)
 
 
 def _frames(points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Coefficients a, b and c, ``(3, P, S)``, of orthonormal tangents a du and b du + c dv; area elements ``(P, S)``.
-
-    All are zero where the area element vanishes.
-    """
+    """``(3, P, S)`` a, b, c of orthonormal tangents a du, b du + c dv; area elements ``(P, S)``. Zero without area."""
     du, dv = points[:2]
     area = np.linalg.norm(np.cross(du, dv), axis=-1)
     length = np.linalg.norm(du, axis=-1)

@@ -34,14 +34,12 @@ PARALLEL = 1e-12
 VANISHING = 1e-100
 # Factor by which a step that increases the distance is shortened.
 SHORTER = 0.25
-# Points per run, whose arrays stay in a processor's cache.
-CHUNK = 4096
+# Points, and boxes, per run, whose arrays stay in a processor's cache.
+CHUNK, RUN = 4096, 1024
 # Rounding error of a distance, relative to the size of the coordinates: some units of double precision.
 ROUNDED = 2.0**-50
 # Tolerance of the products of an orthonormal frame's vectors.
 SQUARE = 1e-12
-# Boxes or points per run, whose arrays stay in a processor's cache.
-RUN = 1024
 # Least length of a tangent, to which shorter ones are clamped so that divisions by its square do not overflow.
 SHORTEST = 1e-100
 
@@ -55,8 +53,7 @@ def nearest_in_pieces(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Find a local minimum of the distance from each point to its piece.
 
-    Returns parameters in the piece, (s, 2) float64; the squared distances; and the `slopes` of the distance, which are
-    not zero where the minimum lies on an edge of the piece.
+    Returns ``(s, 2)`` parameters, squared distances, and `slopes`, not zero where a minimum lies on a piece's edge.
     """
     runs = np.split(np.arange(len(points)), range(CHUNK, len(points), CHUNK))
     minima = [_nearest(pieces, which[run], points[run], uv[run], size) for run in runs]
@@ -67,7 +64,6 @@ def nearest_in_pieces(
 def _nearest(
     pieces: PolynomialPieces, which: IntArray, points: FloatArray, uv: FloatArray, size: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """`nearest_in_pieces` for one run of points."""
     uv, jet, rounded = uv.copy(), _jet(pieces, which, points, uv), ROUNDED * size
     # Fraction of the next step that is taken; and points that have not converged.
     part, left = np.ones(len(uv)), np.arange(len(uv))
@@ -89,10 +85,7 @@ def _nearest(
 
 
 def _step(domain: ParameterDomain, at: FloatArray, jet: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Compute the step: Newton's, along an edge where it would leave the domain, and cut at the next edge.
-
-    Returns the step, (s, 2) float64, and whether it is a full Newton step.
-    """
+    """Newton's step ``(s, 2)``, along an edge where it would leave the domain, cut at the next; whether it is full."""
     normals, difference, tangents = domain.edge_normals, jet[:, 0], jet[:, 1:3]
     gradient = np.einsum("sdx,sx->sd", tangents, difference)
     metric = tangents @ tangents.swapaxes(1, 2)
@@ -141,10 +134,9 @@ def _jet(pieces: PolynomialPieces, piece: IntArray, points: FloatArray, uv: Floa
 
 
 def slopes(tangents: FloatArray, difference: FloatArray) -> FloatArray:
-    """``(s,)`` rates at which the distance falls along a surface, for tangents ``(s, 2, 3)``, differences ``(s, 3)``.
+    """``(s,)`` larger components of differences ``(s, 3)`` along unit tangents: how fast the distance falls there.
 
-    The larger of the difference's components along the two unit tangents; zero, up to rounding, if the difference is
-    along the normal.
+    ``tangents`` are ``(s, 2, 3)``. Zero, up to rounding, if the difference is along the normal.
     """
     along = np.abs(np.einsum("sdx,sx->sd", tangents, difference))
     lengths = np.sqrt(np.einsum("sdx,sdx->sd", tangents, tangents))
@@ -153,11 +145,7 @@ def slopes(tangents: FloatArray, difference: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class TurnedBoxes(PartArrays):
-    """Oriented boxes around pieces.
-
-    ``bends``, ``curvatures`` and ``stretch`` are for parameters in which the tangents at the middle of the piece's
-    domain are orthonormal.
-    """
+    """Oriented boxes around pieces, with bounds by parameters whose tangents at the middle are orthonormal."""
 
     basis: BernsteinBasis  # Of the pieces
     frames: FloatArray  # (n, 3, 3) float64: unit vectors along the sides, the last one along the piece's normal
@@ -174,7 +162,6 @@ class TurnedBoxes(PartArrays):
 
     @classmethod
     def around(cls, pieces: PolynomialPieces) -> TurnedBoxes:
-        """Compute boxes around pieces."""
         # Where tangents vanish, bends are infinite, and no piece passes as convex.
         with np.errstate(over="ignore", invalid="ignore"):
             return cls.joined(
@@ -238,10 +225,9 @@ class TurnedBoxes(PartArrays):
         which: IntArray,  # (s,) int64: index of each point's box
         squared_reach: FloatArray,  # (s,) float64: largest squared distance of each point from its box
     ) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Find the points that are within reach of their boxes.
+        """Find the points within reach of their boxes: indices ``(n,)``, and their squared distances from the boxes.
 
-        Returns the indices of these points, (n,) int64; their squared distances from the boxes; and the vectors from
-        them to the centres of the boxes in the coordinates of `frames`, (n, 3) float64.
+        And the vectors ``(n, 3)`` from them to the centres of the boxes in the coordinates of `frames`.
         """
         near_of_runs = [(np.empty(0, dtype=np.int64), np.empty(0), np.empty((0, 3)))]
         for begin in range(0, len(which), RUN):
@@ -261,10 +247,9 @@ class TurnedBoxes(PartArrays):
         away: FloatArray,  # (n, 3) float64: as returned by `near`
         which: IntArray,  # (n,) int64: index of each point's box
     ) -> NDArray[np.bool_]:
-        """``(n,)`` whether the squared distance from a point has one minimum in its piece.
+        """``(n,)`` whether a bound shows that the squared distance is a convex function of the piece's parameters.
 
-        True if a bound shows that it is a convex function of the piece's parameters. Half its Hessian is the first
-        fundamental form plus the products of the difference with the second derivatives of the surface.
+        Half its Hessian is the first fundamental form plus the products of the difference with second derivatives.
         """
         halves = self.halves[which]
         across, half, curvatures = away[:, 2:], halves[:, 2:], self.curvatures[which]

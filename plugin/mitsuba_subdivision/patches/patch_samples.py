@@ -35,13 +35,10 @@ def located_runs(
     corner: IntArray,
     uv: FloatArray,  # (s, 2) float64: parameters, starting at that corner
 ) -> Iterator[tuple[IntArray, LocatedSamples, list[PatchClass]]]:
-    """Locate samples in runs sorted by class, so that a run has few classes.
-
-    Iterates over the indices of samples, their locations, and the classes that are the elements of these.
-    """
+    """Locate samples in runs of few classes: indices, locations, and the classes that are the elements of these."""
     scheme, classes = patches.scheme, patches.classes
     order = np.argsort(class_index.astype(np.min_scalar_type(len(classes))), kind="stable")
-    runs = [order[part] for part in ragged.runs_of(patches.control_counts[class_index[order]], WEIGHTS)]
+    runs = [order[part] for part in ragged.runs_of(patches.rings.vertex_counts[class_index[order]], WEIGHTS)]
     for run in counted(runs, "Located samples"):
         used, element = np.unique(class_index[run], return_inverse=True)
         run_classes = [classes[index] for index in used.tolist()]
@@ -55,7 +52,8 @@ class PatchSampler:
 
     patches: PatchTable
     control_values: FloatArray  # (n, k) float64
-    control_of_vertex: IntArray  # (n_v,) int64: 0-based row of ``control_values`` at each mesh vertex
+    # (n_v,) int64: 0-based row of ``control_values`` at each mesh vertex, by default those of the patches
+    control_of_vertex: IntArray | None = None
 
     def evaluate(
         self,
@@ -88,7 +86,8 @@ class PatchSampler:
     @cached_property
     def _values(self) -> FloatArray:
         """``(n_v, k)`` control values at the mesh's vertices."""
-        return self.control_values[self.control_of_vertex]
+        of_patches = self.patches.control_of_vertex
+        return self.control_values[of_patches if self.control_of_vertex is None else self.control_of_vertex]
 
 
 class StencilMatrices(NamedTuple):
@@ -119,16 +118,19 @@ class StencilMatrices(NamedTuple):
 
 def stencil_matrices(
     patches: PatchTable,
-    control_of_vertex: IntArray,  # (n_v,) int64: 0-based control point at each mesh vertex
-    control_count: int,
     # Locations of the samples, as for `PatchSampler.evaluate`
     half_edge: IntArray,
     uv: FloatArray,
     # Returns (s_element, m, K) weights for each element, such as `limit_stencils`
     stencils: Callable[[LocatedSamples], list[FloatArray]],
     count: int,  # m, number of matrices
+    # As for `PatchTable`, by default its own
+    control_of_vertex: IntArray | None = None,
+    control_count: int = 0,
 ) -> list[sparse.csr_array]:
     """Limit stencils of samples as ``m`` matrices ``(s, control_count)``."""
+    if control_of_vertex is None:
+        control_of_vertex, control_count = patches.control_of_vertex, patches.control_count
     class_index, patch, corner = patches.patch_at(half_edge)
     # Samples at the same parameters of patches of a class have the same weights.
     order = np.lexsort((*uv.T[::-1], corner, class_index))

@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ..evaluation.patch_tree import PatchTree, patch_trees
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.one_ring import RingTable, one_rings
-from ..mesh.shared import Content, Shared
+from ..mesh.shared import Content, shared
 from ..mesh.signature import Signature, fan_codes, row_codes, signatures_at
+from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 
 if TYPE_CHECKING:
@@ -29,9 +31,6 @@ if TYPE_CHECKING:
 MANY_CLASSES = 100
 FEW_PATCHES = 200
 FEWER = 4
-
-# Refinement matrices, shared by tessellations and exact shading.
-_REFINEMENTS: Shared[sparse.csr_array] = Shared()
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,12 +60,19 @@ class PatchTable:
         topology: Topology,  # The mesh: the cage, cut along its creases
         scheme: Scheme,
         is_hole: NDArray[np.bool_] | None = None,  # (n_f,) bool: faces that are no elements
+        # (n_v,) int64: 0-based control point at each mesh vertex, and number of control points. By default mesh
+        # vertices are control points.
+        control_of_vertex: IntArray | None = None,
+        control_count: int | None = None,
         *,
         # Whether a patch may begin at any corner of its element, so that elements whose one-rings are equal up to
         # rotation share a class. If not, a patch begins at its element's first corner.
         may_turn: bool = True,
     ) -> None:
         self.topology, self.scheme, self.is_hole, self.may_turn = topology, scheme, is_hole, may_turn
+        count = topology.vertex_count
+        self.control_of_vertex = np.arange(count) if control_of_vertex is None else control_of_vertex
+        self.control_count = count if control_count is None else control_count
         # The mesh whose faces are the elements: the cage's mesh, or its dual, whose vertices are the cage's faces. A
         # face of the dual begins at the lowest half-edge of its vertex. Holes and border vertices, which are no
         # elements, become faces without corners.
@@ -102,11 +108,6 @@ class PatchTable:
         """`PatchClass.controls` of all classes, flat."""
         return self.rings.vertices
 
-    @property
-    def control_counts(self) -> IntArray:
-        """``(c,)`` K, the number of control points of a patch, of each class."""
-        return self.rings.vertex_counts
-
     @cached_property
     def _signatures(self) -> list[Signature]:
         first = self._patch_codes[0][self._order[0][[0, *self._order[1]]]]
@@ -117,9 +118,8 @@ class PatchTable:
     @cached_property
     def rings(self) -> RingTable:
         """The one-rings of all patches, class by class."""
-        order, bounds = self._order
-        half_edges = self.half_edge_of_corner[self._patch_codes[0][order]]
-        return RingTable(self.topology, one_rings(self._signatures), half_edges, np.diff([0, *bounds, len(order)]))
+        half_edges = self.half_edge_of_corner[self._patch_codes[0][self._order[0]]]
+        return RingTable(self.topology, one_rings(self._signatures), half_edges, self.patch_counts)
 
     def forget(self) -> None:
         """Drop what is computed again on demand, for a mesh that nothing is evaluated on but kernels made of it."""
@@ -136,6 +136,16 @@ class PatchTable:
     @property
     def class_count(self) -> int:
         return len(self._order[1]) + 1
+
+    @property
+    def patch_counts(self) -> IntArray:
+        """``(c,)`` number of patches of each class."""
+        return np.diff([0, *self._order[1], self.patch_count])
+
+    @property
+    def trees(self) -> list[PatchTree]:
+        """The completely divided patch tree of each class. One call makes all, as they share most of their data."""
+        return patch_trees(self.scheme, [patch_class.signature for patch_class in self.classes])
 
     @cached_property
     def _order(self) -> tuple[IntArray, IntArray]:
@@ -160,26 +170,39 @@ class PatchTable:
             return None
         return RefinedPatches(table, refinement.stencils.matrix)
 
+    @property
+    def evaluated(self) -> PatchTable:
+        """The table whose patches are evaluated: that of the cage refined once, or this one."""
+        return self if self.refined is None else self.refined.table
+
+    def places(self, patch_class: PatchClass) -> IndexArray:
+        """``(p,)`` the corner of the element that each patch of `evaluated` covers, a half-edge of `elements`."""
+        # As the scheme `splits_corners`, face h of the refined cage lies at half-edge h of the cage, and begins there.
+        return patch_class.corners if self.refined is None else self.evaluated.topology.face[patch_class.corners]
+
+    def evaluated_at(self, corners: IntArray) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """`patch_at` in `evaluated`, for half-edges of this table's `elements` at which its patches begin."""
+        return self.evaluated.patch_at(
+            corners if self.refined is None else self.evaluated.topology.face_offsets[corners]
+        )
+
+    def evaluated_points(self, points: FloatArray) -> FloatArray:
+        """``(n, k)`` values at the vertices of the mesh of `evaluated`, from those at this table's mesh vertices."""
+        return points if self.refined is None else self.refined.matrix @ points
+
     def control_rows(
         self,
-        control_of_vertex: IntArray,  # (n_v,) int64: 0-based control value at each mesh vertex
-        control_count: int,
+        # By default those of the table
+        control_of_vertex: IntArray | None = None,
+        control_count: int = 0,
     ) -> tuple[NDArray[np.uint32], sparse.csr_array | None]:
         """`controls` as rows of control values; for refined patches, also the matrix that refines the cage's values."""
+        if control_of_vertex is None:
+            control_of_vertex, control_count = self.control_of_vertex, self.control_count
         refined = self.refined
         if refined is not None:
-            from scipy import sparse
-
-            def make() -> sparse.csr_array:
-                # Mesh vertices with the same control point share a column, where their weights add up, in place.
-                weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
-                columns = control_of_vertex.astype(weights.indices.dtype)[weights.indices]
-                matrix = sparse.csr_array((weights.data, columns, weights.indptr), shape=shape, copy=True)
-                matrix.sum_duplicates()
-                return matrix
-
-            key = refined, Content(control_of_vertex), control_count
-            return refined.table.controls.view(np.uint32), _REFINEMENTS.get(key, make)
+            matrix = shared(_over_control_values, refined, Content(control_of_vertex), control_count)
+            return refined.table.controls.view(np.uint32), matrix
         controls = self.controls
         if not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex))):
             controls = control_of_vertex.astype(np.int32)[controls]
@@ -193,10 +216,10 @@ class PatchTable:
     @cached_property
     def _patch_of_corner(self) -> tuple[IntArray, IndexArray, NDArray[np.int8]]:
         """`patch_at` for all half-edges, in small integer types, as a cage may have millions of them."""
-        t, (order, bounds) = self.elements, self._order
+        t = self.elements
         dtypes = np.min_scalar_type(-self.class_count), np.int32, np.int8
         class_index, patch, patch_corner = (np.full(t.half_edge_count, -1, dtype=dtype) for dtype in dtypes)
-        corners, counts = self._patch_codes[0][order], np.diff([0, *bounds, len(order)])
+        corners, counts = self._patch_codes[0][self._order[0]], self.patch_counts
         in_class, index = np.repeat(np.arange(len(counts)), counts), ragged.index_in_row(counts)
         for turn in range(self.scheme.domain.corner_count):
             class_index[corners], patch[corners], patch_corner[corners] = in_class, index, turn
@@ -221,12 +244,9 @@ class PatchTable:
         for size in np.flatnonzero(np.bincount(sizes)).tolist():
             corners.append(partial[sizes == size])
             # Codes of the fans at all corners, from the first one on, distinguish the signatures of patches.
-            columns, corner = [], corners[-1]
-            for _ in range(1 if self.scheme.element == "vertex" else size):
-                columns.append(fans[corner])
-                corner = t.next[corner]
+            around = t.around_faces(corners[-1], 1 if self.scheme.element == "vertex" else size)
             first_unused = 1 + max(int(codes_of_size.max(initial=0)) for codes_of_size in codes)
-            codes.append(row_codes(columns).astype(np.int64) + first_unused)
+            codes.append(row_codes([fans[corner] for corner in around]).astype(np.int64) + first_unused)
         return np.concatenate(corners, dtype=np.int32), np.concatenate(codes), of_mesh
 
     def _turned_to_least(
@@ -255,20 +275,25 @@ class PatchTable:
         return corners + turns, least
 
 
+def _over_control_values(refined: RefinedPatches, control_of_vertex: Content, control_count: int) -> sparse.csr_array:
+    from scipy import sparse
+
+    # Mesh vertices with the same control value share a column, where their weights add up, in place.
+    weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
+    columns = control_of_vertex.array.astype(weights.indices.dtype)[weights.indices]
+    matrix = sparse.csr_array((weights.data, columns, weights.indptr), shape=shape, copy=True)
+    matrix.sum_duplicates()
+    return matrix
+
+
 @dataclass(frozen=True, eq=False)
 class RefinedPatches:
     """Patches of a cage refined once, under a scheme that makes a quadrilateral of every face corner.
 
-    They serve cages of many classes: where polygons of many sizes meet vertices of many valences, nearly every patch
-    may be the only one of its class, and the stencils of a class take milliseconds. In the refined cage, an old vertex
-    has only new neighbours, which are of few kinds, so that few classes are left. Normals in float32 are 2 to 5 times
-    less exact, as the refined cage's vertices are rounded.
+    They serve cages where polygons of many sizes meet vertices of many valences, so that nearly every patch is a class.
+    In the refined cage, an old vertex has only new neighbours, which are of few kinds. Normals in float32 are 2 to 5
+    times less exact, as the refined cage's vertices are rounded.
     """
 
     table: PatchTable  # Of the refined cage, whose faces are all elements, and whole
     matrix: sparse.csr_array  # (n, n_v) weights of the mesh's vertices at the refined cage's vertices
-
-    def corners(self, patch_class: PatchClass) -> IndexArray:
-        """``(p,)`` the corner of the cage's element that each patch covers, a half-edge of the cage's `elements`."""
-        # As the scheme `splits_corners`, face h of the refined cage lies at half-edge h of the cage, and begins there.
-        return self.table.topology.face[patch_class.corners]

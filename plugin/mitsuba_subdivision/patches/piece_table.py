@@ -3,13 +3,9 @@
 The samples of a kernel are unknown before it runs. So elements are divided completely (`patch_trees`). Each node is an
 inner node, with four children or one; a regular piece; or a tip, the patch around an extraordinary point.
 
-A regular piece is a polynomial, whose coefficients are weights times the control points of the element's one-ring. So
-is each of the three regular children at the first levels of a tip. These coefficients are computed once for the control
-points, and suffice for nearly all samples: after three levels a 64th of a tip's domain is left.
-
-Deeper levels are sums by equations (10) and (12). Their terms are polynomials that all levels and all tips of a kind
-share, times a factor for each level, times eigen-coordinates of the tip, which are computed as its pieces are. The
-first eigenvector, which is constant, contributes only to the point itself.
+Regular pieces, and the three regular children at the first levels of a tip, are polynomials, whose coefficients are
+computed once for the control points, and suffice for nearly all samples. Deeper levels are sums by equations (10) and
+(12): section 7 of plugin/MATHEMATICS.md. The first eigenvector, which is constant, contributes only to the point.
 """
 
 from __future__ import annotations
@@ -17,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import lru_cache
-from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -25,14 +20,13 @@ from numpy.typing import NDArray
 
 from ..evaluation.equations import times_matrix
 from ..evaluation.irregular_patch import LEVEL_PIECES, PIECE_LEVELS, IrregularPatch, float32_levels, level_polynomials
-from ..evaluation.patch_tree import PartKind, PatchTree, patch_trees
+from ..evaluation.patch_tree import PartKind, PatchTree
 from ..evaluation.polynomials import polynomial_basis
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..mesh.shared import Content, Shared
+from ..mesh.shared import Content, shared
 from ..messages import counted
 from ..schemes.domain import FloatArray
-from ..schemes.scheme import Scheme
 from .patch_table import PatchTable
 
 if TYPE_CHECKING:
@@ -59,6 +53,11 @@ COEFFICIENT_BYTES = 1 << 26
 # Maximum number of pieces of a part whose coefficients are stored as a whole. Larger elements are split into parts:
 # along semi-sharp creases there are thousands of parts of few kinds, which share coefficients.
 SHARED_PIECES = 64
+
+
+# Rows of `PieceTable.classes`: index of the first entry in `controls`; numbers of patches and of controls per patch;
+# first piece, and number of pieces per patch.
+CLASS = np.dtype([(name, np.int64) for name in ("first_control", "patches", "controls", "first_piece", "pieces")])
 
 
 class FrameKind(IntEnum):
@@ -110,9 +109,7 @@ class TreeArrays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PieceTable:
-    """The pieces of all patches, and the neighbours of elements.
-
-    An element is identified by one of its half-edges, at which parameters start, as in `PatchSampler.evaluate`.
+    """The pieces of all patches, and the neighbours of elements, which are identified by one of their half-edges.
 
     *Coefficients* depend on the control points. They are the polynomials of the pieces of all patches, a number of each
     component for each monomial, padded to whole packets.
@@ -127,9 +124,7 @@ class PieceTable:
     nodes: NDArray[np.uint32]
     elements: tuple[PatchTree, ...]  # Of each class
     tips: tuple[Tip, ...]  # Different ones of all classes
-    # (c, 5) uint32, for each class: index of its first entry in `controls`; number of patches, and of controls per
-    # patch; first piece; number of pieces per patch
-    classes: NDArray[np.uint32]
+    classes: NDArray[np.void]  # (c,) of type `CLASS`
     control_of_vertex: IntArray  # (n_v,) int64: 0-based control value at each mesh vertex
     # (n, control_count) matrix from control values to refined ones, if patches are those of the cage refined once
     refinement: sparse.csr_array | None
@@ -138,24 +133,23 @@ class PieceTable:
     def build(
         cls,
         patches: PatchTable,
-        control_of_vertex: IntArray,  # (n_v,) int64: 0-based control value at each mesh vertex
-        control_count: int,
+        # As for `PatchTable`, by default its own
+        control_of_vertex: IntArray | None = None,
+        control_count: int = 0,
         # Number of levels of tips that are stored as pieces; fewer where these exceed COEFFICIENT_BYTES
         piece_levels: int = PIECE_LEVELS,
     ) -> PieceTable:
         """Prepare the evaluation of patches. Calls with equal arguments share the object while it is referenced."""
-        key = patches, Content(control_of_vertex), control_count, piece_levels
-        return _TABLES.get(key, lambda: cls._build(patches, control_of_vertex, control_count, piece_levels))
+        if control_of_vertex is None:
+            control_of_vertex, control_count = patches.control_of_vertex, patches.control_count
+        return shared(cls._build, patches, Content(control_of_vertex), control_count, piece_levels)
 
     @classmethod
     def _build(
-        cls, patches: PatchTable, control_of_vertex: IntArray, control_count: int, piece_levels: int
+        cls, patches: PatchTable, control_of_vertex: Content, control_count: int, piece_levels: int
     ) -> PieceTable:
-        refined = patches.refined
-        table = patches if refined is None else refined.table
-        counts, control_counts = np.array([len(kind.corners) for kind in table.classes]), table.control_counts
-        # Building all trees in one call shares most of their data.
-        elements = patch_trees(table.scheme, [kind.signature for kind in table.classes])
+        table = patches.evaluated
+        counts, elements = table.patch_counts, table.trees
         tip_count = int(np.array([element.tip_count for element in elements]) @ counts)
         packet_count = piece_packets(len(polynomial_basis(table.scheme).powers)) * LEVEL_PIECES * tip_count
         bytes_of_level = 4 * PACKET * packet_count
@@ -164,7 +158,7 @@ class PieceTable:
         trees = [tree_arrays(element, piece_levels) for element in counted(elements, "Pieces of patch classes")]
         sizes = np.array([tree.piece_count for tree in trees])
         first_pieces, piece_count = ragged.starts(sizes * counts), int(sizes @ counts)
-        columns = [kind.first_control for kind in table.classes], counts, control_counts, first_pieces, sizes
+        columns = table.rings.offsets[:-1], counts, table.rings.vertex_counts, first_pieces, sizes
         node_counts = np.array([len(tree.nodes) for tree in trees])
         first_nodes, nodes = ragged.starts(node_counts), np.concatenate([tree.nodes for tree in trees])
         every_tip = [tip for tree in trees for tip in tree.tips]
@@ -186,9 +180,9 @@ class PieceTable:
             nodes.astype(np.uint32),
             tuple(elements),
             tips,
-            np.stack(columns, axis=1).astype(np.uint32),
-            control_of_vertex,
-            patches.control_rows(control_of_vertex, control_count)[1],
+            np.array([*zip(*columns, strict=True)], dtype=CLASS),
+            control_of_vertex.array,
+            patches.control_rows(control_of_vertex.array, control_count)[1],
         )
 
     @property
@@ -209,15 +203,10 @@ class PieceTable:
         `PATCH` times the index of the patch, plus `WHOLE` if the element is whole, plus `PATCH_CORNER` times the corner
         of the patch at which the half-edge begins, plus the corner of the element if that is whole, else 0.
         """
-        patches = self.patches
-        t, refined = patches.elements, patches.refined
+        patches, t = self.patches, self.patches.elements
         half_edge = np.arange(t.half_edge_count, dtype=np.int32)
-        # Face h of the cage refined once lies at half-edge h of the cage, and begins there.
-        table = patches if refined is None else refined.table
-        patch_half_edge = half_edge if refined is None else table.topology.face_offsets[:-1]
-        class_index, patch, patch_corner = table.patch_at(patch_half_edge)
-        first_patch = ragged.starts(np.array([len(patch_class.corners) for patch_class in table.classes]))
-        face = t.face[half_edge]
+        class_index, patch, patch_corner = patches.evaluated_at(half_edge)
+        first_patch, face = ragged.starts(patches.evaluated.patch_counts), t.face
         is_whole = patches.is_whole[face]
         columns = np.empty((len(half_edge), 4), dtype=np.uint32)
         columns[:, TWIN] = np.where(t.twin < 0, NOTHING, t.twin.astype(np.int64))
@@ -226,9 +215,6 @@ class PieceTable:
         patch = first_patch[class_index] + patch
         columns[:, CODE] = PATCH * patch + WHOLE * is_whole + PATCH_CORNER * patch_corner + corner
         return columns
-
-
-_TABLES: Shared[PieceTable] = Shared()
 
 
 def piece_packets(monomial_count: int, size: int = 3) -> int:
@@ -243,21 +229,22 @@ def tree_arrays(
     piece_levels: int = PIECE_LEVELS,  # Number of levels of a tip that are pieces; the others are summed
 ) -> TreeArrays:
     """Return the arrays of a patch tree."""
-    scheme = element.scheme
     kinds, turns, first = element.nodes.T.copy()
-    index, end = np.zeros((2, len(first)), dtype=np.int64)
+    index, last = np.zeros((2, len(first)), dtype=np.int64)
     # Regular pieces come before those of tips.
     maps, piece_count = [], 0
-    for part, stencils in _shared_parts(element):
-        pieces = _regular_pieces(scheme, part)
+    parts, rows = _shared_parts(element)
+    all_stencils = [None] if rows is None else np.split(rows, np.cumsum([part.control_count for part in parts])[:-1])
+    for part, stencils in zip(parts, all_stencils, strict=True):
+        pieces = _regular_pieces(part)
         maps.append(PieceMap(piece_count, stencils, pieces))
         piece_count += len(pieces)
     # In nodes of tips, `first` is the index in `PatchTree.tips`.
     tip_nodes, tips = np.flatnonzero(kinds == PartKind.TIP), list[Tip]()
     for node, piece in zip(tip_nodes[np.argsort(first[tip_nodes])].tolist(), element.tips, strict=True):
-        tip, of_levels = _tip(scheme, piece.irregular_patch), _tip_pieces(scheme, piece.irregular_patch, piece_levels)
+        tip, of_levels = _tip(piece.irregular_patch, piece_levels)
         first[node], index[node] = piece_count, len(tips)
-        end[node] = tip.frame + LEVEL * tip.level_count + TERM * len(tip.coordinates)
+        last[node] = tip.frame + LEVEL * tip.level_count + TERM * len(tip.coordinates)
         coordinates = tip.coordinates[1:] @ piece.coordinates
         # Each piece begins with the first coordinate, as the weights of a piece's constant sum to one.
         width = of_levels.shape[1] - 1
@@ -267,15 +254,15 @@ def tree_arrays(
         maps.append(PieceMap(piece_count, None, pieces))
         tips.append(tip)
         piece_count += len(pieces)
-    nodes = np.stack([kinds + TURN * turns, first, index, end], axis=1)
+    nodes = np.stack([kinds + TURN * turns, first, index, last], axis=1)
     maps = [piece_map for piece_map in maps if len(piece_map.pieces)]
     return TreeArrays(nodes, piece_count, tuple(maps), tuple(tips))
 
 
 @lru_cache(maxsize=1024)
-def _tip(scheme: Scheme, patch: IrregularPatch) -> Tip:
-    """Return the terms of a tip."""
-    basis, polynomials, level_count = patch.basis, polynomial_basis(scheme), float32_levels(patch)
+def _tip(patch: IrregularPatch, piece_levels: int) -> tuple[Tip, FloatArray]:
+    """Return the terms of a tip, and polynomials ``(n, m, K)`` of its first levels over the eigen-coordinates."""
+    basis, polynomials, level_count = patch.basis, polynomial_basis(patch.scheme), float32_levels(patch)
     left, coordinates, factors = basis.power_terms(level_count)
     term_count = len(coordinates)
     blocks: FloatArray = np.zeros((FACTORS, term_count, len(polynomials.powers)))
@@ -286,7 +273,7 @@ def _tip(scheme: Scheme, patch: IrregularPatch) -> Tip:
     rest[:, [u, v]] = basis.subdominant**level_count * patch.edge_tangents.T
     frame[:, [u, v]] = patch.limit_frame.T
     # Polynomials are about the middle of the domain, and the extraordinary point is at its corner.
-    rest[:, 0] = rest[:, [u, v]] @ scheme.domain.centre
+    rest[:, 0] = rest[:, [u, v]] @ patch.scheme.domain.centre
     rest_factors, tables = np.ones((1, term_count)), [factors]
     if patch.contracts_unevenly:
         across = factors / basis.moduli[2] ** np.arange(level_count)[:, None]
@@ -297,40 +284,24 @@ def _tip(scheme: Scheme, patch: IrregularPatch) -> Tip:
     rows = np.pad(blocks.reshape(-1, blocks.shape[2]), ((0, 0), (0, size - blocks.shape[2])))
     rows = np.concatenate([rows, np.pad(values, (0, -len(values) % size)).reshape(-1, size)])
     kind = FrameKind.AT_POINT if patch.has_own_frame else FrameKind.DERIVATIVES
-    return Tip(rows, coordinates, FrameKind.UNEVEN if patch.contracts_unevenly else kind, level_count)
+    pieces = level_polynomials(patch, polynomials.matrix, np.arange(piece_levels))
+    tip = Tip(rows, coordinates, FrameKind.UNEVEN if patch.contracts_unevenly else kind, level_count)
+    return tip, pieces.reshape(LEVEL_PIECES * piece_levels, *pieces.shape[2:])
 
 
-@lru_cache(maxsize=1024)
-def _tip_pieces(scheme: Scheme, patch: IrregularPatch, piece_levels: int) -> FloatArray:
-    """Return the polynomials of the first levels of a tip over the eigen-coordinates, ``(n, m, K)``."""
-    by_level = level_polynomials(patch, polynomial_basis(scheme).matrix, np.arange(piece_levels))
-    return by_level.reshape(by_level.shape[0] * by_level.shape[1], *by_level.shape[2:])
-
-
-def _shared_parts(element: PatchTree) -> list[tuple[PatchTree, FloatArray | None]]:
-    """Return the largest parts with at most `SHARED_PIECES` pieces, and their stencils; None for the whole element."""
+def _shared_parts(element: PatchTree) -> tuple[list[PatchTree], FloatArray | None]:
+    """Return the largest parts of at most `SHARED_PIECES` pieces, and all their stencils; None for a whole element."""
     if element.piece is not None or element.regular_count <= SHARED_PIECES:
-        return [(element, None)]
-    parts, rows = _stacked_parts(element)
-    bounds = pairwise(ragged.offsets([part.control_count for part in parts]).tolist())
-    return [(part, rows[slice(*span)]) for part, span in zip(parts, bounds, strict=True)]
-
-
-def _stacked_parts(element: PatchTree) -> tuple[list[PatchTree], FloatArray]:
-    """Return `_shared_parts` of an element that is divided, with all stencils in one array."""
+        return [element], None
     parts, rows = list[PatchTree](), []
     for child, stencils in element.children:
-        if child.piece is not None or child.regular_count <= SHARED_PIECES:
-            parts.append(child)
-            rows.append(stencils)
-        else:
-            of_child, of_parts = _stacked_parts(child)
-            parts += of_child
-            rows.append(times_matrix(of_parts[None], stencils)[0])
+        of_child, of_parts = _shared_parts(child)
+        parts += of_child
+        rows.append(stencils if of_parts is None else times_matrix(of_parts[None], stencils)[0])
     return parts, np.concatenate(rows)
 
 
 @lru_cache(maxsize=1024)
-def _regular_pieces(scheme: Scheme, element: PatchTree) -> FloatArray:
+def _regular_pieces(element: PatchTree) -> FloatArray:
     """Return ``(p, m, K)`` coefficients of an element's regular pieces."""
-    return element.coefficients(polynomial_basis(scheme).matrix)
+    return element.coefficients(polynomial_basis(element.scheme).matrix)

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
-from functools import lru_cache, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..evaluation.irregular_patch import IrregularPatch, level_at_size, level_domains, level_rows, rest_rows
-from ..evaluation.patch_tree import PatchTree, patch_trees
+from ..evaluation.patch_tree import PatchTree
 from ..evaluation.polynomials import BernsteinBasis, polynomial_basis, times
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..messages import counted
 from ..schemes.domain import FloatArray, ParameterMap
 from .patch_table import PatchTable
 
-# Size, relative to the patch, down to which levels around extraordinary points are bounded by Bernstein coefficients,
-# as they shrink by the second eigenvalue. The looser bound of the remaining levels is then small beside the element.
+# Size, relative to the patch, down to which levels around extraordinary points are bounded by Bernstein coefficients.
+# The looser bound of the remaining levels is then small beside the element.
 TIP_SIZE = 1 / 64
 # Pieces per run when computing boxes, whose arrays stay in a processor's cache.
 RUN = 1024
@@ -28,8 +28,8 @@ Parts = TypeVar("Parts", bound="PartArrays")
 # Halvings of an element, here into 8 by 8 parts, before the coefficients of the parts bound it. A box then exceeds the
 # tight one by some percent of the deviation of a part from a plane, a 64th of that of the element.
 HALVINGS = 3
-# Error of evaluation in single precision, in units of the last place of the largest coordinate, and that unit. The
-# largest measured error is seven units, around a face of 50 corners.
+# Error of evaluation in single precision, in units of the last place of the largest coordinate, and that unit. Seven
+# units were measured, around a face of 50 corners.
 UNITS, UNIT = 16, 2.0**-24
 # Pieces that are divided at once, which bounds temporary memory to some megabytes.
 CHUNK = 128
@@ -73,10 +73,7 @@ class PolynomialPieces(PartArrays):
     coefficients: FloatArray  # (n, b, 3) float64: Bernstein coefficients relative to `origins`
 
     def runs(self, length: int) -> Iterator[tuple[slice, FloatArray]]:
-        """Iterate over runs of at most ``length`` pieces, at least one run, with their coefficients ``(b, 3, n)``.
-
-        With the pieces along the last axis, products and extrema take a fraction of the time.
-        """
+        """Iterate over runs of at most ``length`` pieces, at least one run, with their coefficients ``(b, 3, n)``."""
         for begin in range(0, max(len(self), 1), length):
             run = slice(begin, begin + length)
             yield run, np.ascontiguousarray(self.coefficients[run].transpose(1, 2, 0))
@@ -124,7 +121,7 @@ class Tips(PartArrays):
 
     @property
     def bounded_levels(self) -> int:
-        """Number of levels that are bounded by Bernstein coefficients, see `TIP_SIZE`."""
+        """Number of levels that are bounded as pieces, see `TIP_SIZE`."""
         return level_at_size(self.patch, TIP_SIZE)
 
     @property
@@ -143,18 +140,14 @@ class Tips(PartArrays):
     def reach(self, level: int) -> FloatArray:
         """``(t, 3)`` bounds along the axes of the distance from the point to the surface at this and deeper levels."""
         coordinates = np.ascontiguousarray(self.coordinates.transpose(1, 2, 0))
-        return (
-            times(rest_rows(self.patch), np.abs(times(self.patch.basis.block_matrix(level), coordinates))).max(axis=0).T
-        )
+        at_level = np.abs(times(self.patch.basis.block_matrix(level), coordinates))
+        return times(rest_rows(self.patch), at_level).max(axis=0).T
 
 
 def places_below(
     parts: PolynomialPieces | Tips, domains: Sequence[ParameterMap]
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """``half_edge``, ``matrices`` and ``offsets`` of the same parts of all parts, one after the other.
-
-    ``domains`` map the parameters of each part of a part to those of the latter.
-    """
+    """``half_edge``, ``matrices`` and ``offsets`` of parts of all parts, whose parameters ``domains`` map to theirs."""
     return (
         np.tile(parts.half_edge, len(domains)),
         np.concatenate([parts.matrices @ domain.matrix for domain in domains]),
@@ -166,6 +159,7 @@ def places_below(
 class SurfacePieces:
     """A whole surface: polynomial pieces, and tips."""
 
+    elements: Topology  # `PatchTable.elements`
     regular: PolynomialPieces
     tips: tuple[Tips, ...]
     # (n_e, 3) float64: largest absolute coordinates of the control points of each element's patches; zero for holes
@@ -183,17 +177,11 @@ class SurfacePieces:
         patches: PatchTable,
         control_points: FloatArray,  # (n_v, 3) float64: at each mesh vertex
     ) -> SurfacePieces:
-        """Divide all elements."""
-        refined = patches.refined
-        table = patches if refined is None else refined.table
-        if refined is not None:
-            control_points = refined.matrix @ control_points
+        table, points = patches.evaluated, patches.evaluated_points(control_points)
         form, sizes = polynomial_basis(table.scheme), np.zeros((len(patches.elements.face_sizes), 3))
-        trees = patch_trees(table.scheme, [patch_class.signature for patch_class in table.classes])
         regular, tips, known = [], dict[IrregularPatch, list[Tips]](), dict[PatchTree, FloatArray]()
-        for patch_class, tree in counted(list(zip(table.classes, trees, strict=True)), "Pieces of patch classes"):
-            controls = control_points[patch_class.controls]
-            corners = patch_class.corners if refined is None else refined.corners(patch_class)
+        for patch_class, tree in counted(list(zip(table.classes, table.trees, strict=True)), "Pieces of patch classes"):
+            controls, corners = points[patch_class.controls], patches.places(patch_class)
             np.maximum.at(sizes, patches.elements.face[corners], np.abs(controls).max(axis=1))
             half_edge, matrices, offsets = _places(patches, corners, tree)
             rows = tree.coefficients(form.of_controls, known)
@@ -212,17 +200,16 @@ class SurfacePieces:
                 place = half_edge[number], matrices[number], offsets[number]
                 part = Tips(tip.irregular_patch, *place, tip.coordinates @ controls)
                 tips.setdefault(part.patch, []).append(part)
-        return cls(PolynomialPieces.joined(regular), tuple(Tips.joined(alike) for alike in tips.values()), sizes)
+        every_tip = tuple(Tips.joined(alike) for alike in tips.values())
+        return cls(patches.elements, PolynomialPieces.joined(regular), every_tip, sizes)
 
-    def element_bounds(
-        self,
-        elements: Topology,  # `PatchTable.elements`
-    ) -> tuple[FloatArray, FloatArray]:
+    @cached_property
+    def element_bounds(self) -> tuple[FloatArray, FloatArray]:
         """Corners ``(n_e, 3)`` of boxes around all elements; inverted and infinite for faces that are no elements."""
         lower, upper = np.full_like(self.sizes, np.inf), np.full_like(self.sizes, -np.inf)
 
         def widen(half_edge: IntArray, low: FloatArray, high: FloatArray) -> None:
-            element = elements.face[half_edge]
+            element = self.elements.face[half_edge]
             np.minimum.at(lower, element, low)
             np.maximum.at(upper, element, high)
 
@@ -250,8 +237,7 @@ def _places(
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """``half_edge``, ``matrices`` and ``offsets`` of all patches' regular pieces and tips: ``(r + t, p, ...)``.
 
-    In whole elements, parameters start at the corner nearest to the middle of the piece, or to the extraordinary point,
-    so that they lose no digits there.
+    In whole elements, parameters start at the corner nearest to the piece, so that they lose no digits there.
     """
     domain, elements = patches.scheme.domain, patches.elements
     (matrices, offsets), of_tips = tree.regular_domains, [tip.domain.inverse() for tip in tree.tips]
@@ -266,8 +252,7 @@ def _places(
     elif is_whole.all():
         turns = [domain.rotation(turn).inverse() for turn in range(domain.corner_count)]
         turn = np.argmin([domain.extent(turned(near_uv)) for turned in turns], axis=0)
-        for _ in turns[1:]:
-            half_edge = np.concatenate([half_edge, elements.next[half_edge[-1:]]])
+        half_edge = np.stack(elements.around_faces(half_edge[0], domain.corner_count))
         to_corner, starts = (np.array(part)[turn] for part in zip(*turns, strict=True))
         matrices, offsets = to_corner @ matrices, (to_corner @ offsets[:, :, None])[:, :, 0] + starts
     return half_edge[turn], scale[:, None, None] * matrices[:, None], scale[:, None] * offsets[:, None]

@@ -59,10 +59,13 @@ def crease_masks(
 
     share, midpoint = np.ones(sharp_count.shape), border.astype(float)
     if semi is not None:
-        share[0] = _mean_of_smoothed(
-            np.concatenate([centre, np.arange(t.vertex_count), across_vertex]),
-            *np.concatenate([edges, vertices, across], axis=1),
-        )
+        # Mean sharpness of all that becomes smooth. With Chaikin's method it may exceed 1.
+        before, after = np.concatenate([edges, vertices, across], axis=1)
+        is_smoothed = (before > 0) & (after == 0)
+        at = np.concatenate([centre, np.arange(t.vertex_count), across_vertex])[is_smoothed]
+        count = np.bincount(at, minlength=t.vertex_count)
+        total = np.bincount(at, before[is_smoothed], minlength=t.vertex_count)
+        share[0] = np.minimum(total / np.maximum(count, 1), 1)
         share[0, (sharp_count[0] == sharp_count[1]) | (sharp_count[0] < 2)] = 1
         share[1] = 1 - share[0]
         stays_sharp = (semi.edges_refined > 0) & (semi.edges_refined[np.maximum(t.twin, 0)] > 0)
@@ -75,29 +78,17 @@ def crease_masks(
     return smooth, at_vertex, (centre[edge], far[edge], weights), midpoint
 
 
-def _mean_of_smoothed(vertex: IntArray, before: FloatArray, after: FloatArray) -> FloatArray:
-    """Return ``(n_v,)`` mean sharpness of all features that become smooth, which is the weight of the mask before.
-
-    ``vertex`` is that of each feature. With Chaikin's method sharpness may exceed 1, and in meshes cut along seams so
-    may the mean.
-    """
-    is_smoothed = (before > 0) & (after == 0)
-    count = np.bincount(vertex[is_smoothed], minlength=int(vertex.max()) + 1)
-    total = np.bincount(vertex[is_smoothed], before[is_smoothed], minlength=len(count))
-    return np.minimum(total / np.maximum(count, 1), 1)
-
-
 def kept_sharpness(
     topology: Topology,
-    # (n_h',) int: `Topology.face_vertices` of the refined mesh. The faces at coarse corners come first, each listed
-    # from the coarse vertex on.
-    face_vertices: NDArray[np.integer],
-    # Index of the last edge in each of these faces. The first and the last edge are halves of coarse edges.
-    last: int,
+    face_vertices: NDArray[np.integer],  # (n_h',) int: `Topology.face_vertices` of the refined mesh
+    last: int,  # Index of the last edge in each of the faces at coarse corners
     new_count: int,  # Number of appended vertices
     method: CreaseMethod,
 ) -> SemiSharpness | None:
-    """Return the semi-sharp features after a refinement that keeps the vertices and creates a face at every corner."""
+    """Return the semi-sharp features after a refinement that keeps the vertices and creates a face at every corner.
+
+    These faces come first, from the coarse vertex on. Their first and last edges are halves of coarse ones.
+    """
     semi, t = topology.semi_sharpness, topology
     if semi is None:
         return None

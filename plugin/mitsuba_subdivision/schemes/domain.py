@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property, lru_cache, reduce
 from typing import Any, NamedTuple
 
@@ -39,9 +40,7 @@ class ParameterMap(NamedTuple):
 
     def is_same(self, other: ParameterMap) -> bool:
         """Return whether two maps are exactly equal."""
-        if self is other:
-            return True
-        return np.array_equal(self.matrix, other.matrix) and np.array_equal(self.offset, other.offset)
+        return self is other or all(map(np.array_equal, self, other))
 
 
 IDENTITY = ParameterMap(np.eye(2), np.zeros(2))
@@ -113,25 +112,29 @@ class ParameterDomain:
         return np.stack([u, v], axis=1)[self.inside(np.stack([u, v], axis=1) / degree) >= -1 / (2 * degree)]
 
     def extent(self, uv: ArrayLike) -> FloatArray:
-        """Return ``(s,)`` size of the smallest copy of the domain, scaled about (0, 0), that contains ``uv``.
-
-        The size of the domain is 1.
-        """
+        """Return ``(s,)`` size of the smallest copy of the domain, of size 1, about (0, 0) that contains ``uv``."""
         u, v = np.moveaxis(np.asarray(uv), -1, 0)
         return u + v if self._is_triangle else np.maximum(u, v)
 
-    def first_child(self, uv: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-        """Return the first of `children` that contains parameters ``(2, s)``, and the child's parameters ``(2, s)``."""
-        u, v = uv
+    def child_at(self, u: Any, v: Any, select: Callable[..., Any] = np.where) -> tuple[Any, Any, Any, Any]:
+        """Return which of `children` contains parameters: not the first one if their extent is at least 0.5.
+
+        And parameters in the child, with their derivative by the given ones: 2, or -2 where they run backwards.
+        ``select`` is `numpy.where`, or ``drjit.select`` for arrays of Dr.Jit.
+        """
+        right, upper = u >= 0.5, v >= 0.5
         if not self._is_triangle:
-            top = v > 0.5
-            right = (u > 0.5) | (top & (u == 0.5))
-            return right ^ (3 * top), 2 * uv - np.stack([right, top])
-        is_outer = u + v > 0.5
-        right, top = is_outer & (u >= 0.5), is_outer & (u < 0.5) & (v >= 0.5)
-        is_middle = is_outer & ~right & ~top
-        inner = 2 * uv - np.stack([right, top])
-        return right + 2 * top + 3 * is_middle, np.where(is_middle, 1 - inner, inner)
+            number = select(upper, select(right, 2, 3), select(right, 1, 0))
+            return number, 2 * u - select(right, 1, 0), 2 * v - select(upper, 1, 0), 2
+        # Not both at the midpoint of the third side.
+        upper = upper & ~right
+        is_middle = ~(right | upper) & (u + v >= 0.5)
+        return (
+            select(right, 1, select(upper, 2, select(is_middle, 3, 0))),
+            select(is_middle, 1 - 2 * u, 2 * u - select(right, 1, 0)),
+            select(is_middle, 1 - 2 * v, 2 * v - select(upper, 1, 0)),
+            select(is_middle, -2, 2),
+        )
 
     def clamped(self, uv: FloatArray) -> FloatArray:
         """Return ``(s, 2)`` parameters clamped to the domain, to the nearest point or close to it."""

@@ -153,7 +153,6 @@ def _edge_names(topology: Topology) -> IntArray | None:
 
 
 def _box_spline() -> Polynomials:
-    """Return the basis functions, in the order of `Loop.regular_lattice`."""
     corners = (0, 1, 2)
     kinds = [((x, (x + 1) % 3, (x + 2) % 3), _AT_CORNER) for x in corners]
     kinds += [((x, (x + 1) % 3, (x + 2) % 3), _ACROSS_EDGE) for x in corners]
@@ -178,7 +177,7 @@ def _derivative(polynomials: Polynomials, direction: int) -> Polynomials:
 
 
 def _evaluate(polynomials: Polynomials, powers: FloatArray) -> FloatArray:
-    """Return values ``(s, 12)`` from powers ``(5, 3, s)`` of barycentric coordinates, in the same precision."""
+    """Values ``(s, 12)`` from powers ``(5, 3, s)`` of barycentric coordinates, in the same precision."""
     monomials = np.stack([powers[i, 0] * powers[j, 1] * powers[k, 2] for i, j, k in polynomials], axis=1)
     return monomials @ np.array(list(polynomials.values()), dtype=powers.dtype)
 

@@ -249,10 +249,7 @@ class Scheme(ABC):
 
 
 def tensor_basis(u: FloatArray, v: FloatArray, derivatives: int) -> FloatArray:
-    """Multiply the values and derivatives ``(derivatives + 1, r, s)`` of one-dimensional bases along u and v.
-
-    Returns (1 | 3 | 6, s, r * r), u fastest, in the order of `Scheme.regular_basis`.
-    """
+    """Return `Scheme.regular_basis` of products of bases ``(derivatives + 1, r, s)`` along u and v, u fastest."""
     orders = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)][: (derivatives + 1) * (derivatives + 2) // 2]
     size, count = u.shape[1:]
     # Samples are along the last axis in memory, so that NumPy's inner loops are long.

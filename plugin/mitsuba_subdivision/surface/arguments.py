@@ -79,10 +79,8 @@ def _integers(values: ArrayLike, name: str) -> NDArray[np.integer]:
 
 def _reject(values: NDArray, wrong: NDArray[np.bool_], name: str, expected: str) -> None:
     if wrong.any():
-        first = int(np.argmax(wrong))
-        raise ValueError(
-            f"{name} of sample {first} is {in_digits(values[first])}; expected {expected} ({wrong.sum()} such samples)"
-        )
+        first, such = int(np.argmax(wrong)), f"({wrong.sum()} such samples)"
+        raise ValueError(f"{name} of sample {first} is {in_digits(values[first])}; expected {expected} {such}")
 
 
 def require_valences(cage: ControlCage, scheme: Scheme) -> None:

@@ -15,8 +15,7 @@ from ..cage.contents import Attribute
 from ..cage.errors import CageError
 from ..evaluation.element import SurfaceSamples, derivative_stencils
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
-from ..evaluation.located_samples import LocatedSamples, limit_stencils
-from ..mesh.connectivity import IntArray
+from ..evaluation.located_samples import limit_stencils
 from ..mesh.shared import Shared
 from ..patches.area_samples import AreaSamples, SamplingCells, surface_areas, uniform_locations
 from ..patches.channel import Channel, ChannelLayout
@@ -36,7 +35,7 @@ from ..variants import variant_name
 from .arguments import checked_elements, checked_form, checked_samples, require_derivatives, require_valences
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
     from types import ModuleType
 
     from scipy import sparse
@@ -87,7 +86,8 @@ class LimitSurface:
     def __init__(self, cage: ControlCage, scheme: str | Scheme | None = None) -> None:
         if not isinstance(cage, ControlCage):
             raise CageError(f"cage {cage!r}; expected a ControlCage")
-        vars(self).update(cage=cage, scheme=adapted_scheme(cage, scheme))
+        object.__setattr__(self, "cage", cage)
+        object.__setattr__(self, "scheme", adapted_scheme(cage, scheme))
 
     def __reduce__(self) -> tuple[type[LimitSurface], tuple[ControlCage, Scheme]]:
         # The cached sampler holds locks, which cannot be pickled. A copy prepares its own.
@@ -102,15 +102,16 @@ class LimitSurface:
         MemoryError
             If a vertex or face has so high a valence that the weights around it do not fit into memory.
         """
-        return _PATCHES.get((self.cage.structure, self.scheme), self._make_patches)
 
-    def _make_patches(self) -> PatchTable:
-        require_valences(self.cage, self.scheme)
-        topology = self.cage.cut_mesh.topology
-        if self.scheme.element == "face":
-            return PatchTable(topology, self.scheme, self.cage.is_hole)
-        # Sharpness at a non-manifold vertex has no meaning where vertices do not stay.
-        return PatchTable(topology.with_rules(None, None), self.scheme)
+        def make() -> PatchTable:
+            require_valences(self.cage, self.scheme)
+            cut, count = self.cage.cut_mesh, self.cage.vertex_count
+            if self.scheme.element == "face":
+                return PatchTable(cut.topology, self.scheme, self.cage.is_hole, cut.vertex, count)
+            # Sharpness at a non-manifold vertex has no meaning where vertices do not stay.
+            return PatchTable(cut.topology.with_rules(None, None), self.scheme, None, cut.vertex, count)
+
+        return _PATCHES.get((self.cage.structure, self.scheme), make)
 
     def evaluate(
         self,
@@ -160,7 +161,7 @@ class LimitSurface:
 
     @cached_property
     def _sampler(self) -> PatchSampler:
-        return PatchSampler(self.patches, self.cage.positions, self.cage.cut_mesh.vertex)
+        return PatchSampler(self.patches, self.cage.positions)
 
     def matrix(self, element: ArrayLike, uv: ArrayLike, corner: ArrayLike = 0, derivatives: int = 1) -> StencilMatrices:
         """Weights of the control points at samples, as sparse matrices: `evaluate` as linear maps.
@@ -180,17 +181,7 @@ class LimitSurface:
         require_derivatives(derivatives)
         half_edge, uv = checked_samples(self.patches, element, uv, corner)
         stencils = partial(derivative_stencils, derivatives=derivatives)
-        return StencilMatrices(*self._matrices(half_edge, uv, stencils, 3 * derivatives))
-
-    def _matrices(
-        self,
-        half_edge: IntArray,
-        uv: FloatArray,
-        stencils: Callable[[LocatedSamples], list[FloatArray]],
-        count: int,
-    ) -> list[sparse.csr_array]:
-        indices = self.cage.cut_mesh.vertex, self.cage.vertex_count
-        return stencil_matrices(self.patches, *indices, half_edge, uv, stencils, count)
+        return StencilMatrices(*stencil_matrices(self.patches, half_edge, uv, stencils, 3 * derivatives))
 
     def evaluate_attribute(self, name: str, element: ArrayLike, uv: ArrayLike, corner: ArrayLike = 0) -> FloatArray:
         """Evaluate an attribute of the cage, exactly: the limit of its refinement.
@@ -270,7 +261,7 @@ class LimitSurface:
         """
         sizes = self.patches.elements.face_sizes
         chosen = np.flatnonzero(sizes) if element is None else checked_elements(self.patches, element)
-        return ElementBounds(chosen, *(side[chosen] for side in self._bounds))
+        return ElementBounds(chosen, *(side[chosen] for side in self._surface_pieces.element_bounds))
 
     def area(self) -> float:
         """Area of the surface, in squared units of the cage's space.
@@ -346,7 +337,7 @@ class LimitSurface:
     def _energy(self, density: Density, order: int) -> sparse.csr_array:
         if not isinstance(order, numbers.Integral) or order < 1:
             raise ValueError(f"order {order!r}; expected an integer of 1 or more")
-        return energy_matrix(self.patches, self.cage.cut_mesh.vertex, self.cage.positions, density, int(order))
+        return energy_matrix(self.patches, self.cage.positions, density, int(order))
 
     def sample(self, count: int, seed: int | np.random.Generator = 0) -> AreaSamples:
         """Draw independent random points, uniform by area.
@@ -406,25 +397,17 @@ class LimitSurface:
 
     @cached_property
     def _surface_pieces(self) -> SurfacePieces:
-        return SurfacePieces.build(self.patches, self.cage.positions[self.cage.cut_mesh.vertex])
-
-    @cached_property
-    def _bounds(self) -> tuple[FloatArray, FloatArray]:
-        return self._surface_pieces.element_bounds(self.patches.elements)
+        return SurfacePieces.build(self.patches, self.cage.positions[self.patches.control_of_vertex])
 
     @cached_property
     def _areas(self) -> tuple[list[FloatArray], float]:
         return surface_areas(self._surface_pieces)
-
-    def _sampling_cells(self) -> SamplingCells:
-        return SamplingCells.build(self._surface_pieces, self._areas[0])
 
     @cached_property
     def _closest_point_search(self) -> ClosestPointSearch:
         return ClosestPointSearch(self._surface_pieces)
 
     def _element_and_corner(self, half_edge: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Element and corner of half-edges of `PatchTable.elements`."""
         element = self.patches.elements.face[half_edge].astype(np.int64)
         return element, half_edge - self.patches.elements.face_offsets[element]
 
@@ -444,7 +427,7 @@ class LimitSurface:
 
     @cached_property
     def _pieces(self) -> PieceTable:
-        return PieceTable.build(self.patches, self.cage.cut_mesh.vertex, self.cage.vertex_count)
+        return PieceTable.build(self.patches)
 
     def on_device(self, variant: ModuleType | str) -> SurfaceKernel:
         """The surface on a device: evaluated at any parameters, and intersected by rays, in the variant's precision.
@@ -473,7 +456,11 @@ class LimitSurface:
         from ..kernels.surface_kernel import SurfaceKernel
 
         float_type = float_type_of(variant_name(variant))
-        kernel = SurfaceKernel(self.pieces(), float_type, cells=self._sampling_cells)
+
+        def cells() -> SamplingCells:
+            return SamplingCells.build(self._surface_pieces, self._areas[0])
+
+        kernel = SurfaceKernel(self.pieces(), float_type, cells=cells)
         kernel.set_control_points(self.cage.positions)
         return kernel
 
@@ -482,7 +469,7 @@ class LimitSurface:
 
         Surfaces of the same topology, tags and rules share the table of a rate while it is referenced.
         """
-        return uniform_table(self.patches, rate, self.cage.cut_mesh.vertex, self.cage.vertex_count)
+        return uniform_table(self.patches, rate)
 
     def adaptive_sampling(
         self, criterion: Criterion, max_rate: int = 64, control_points: FloatArray | None = None
@@ -518,9 +505,7 @@ class LimitSurface:
                 raise ValueError(f"control points of shape {points.shape}; expected finite ones of shape {shape}")
         from ..tessellation.adaptive import adaptive_table
 
-        return adaptive_table(
-            self.patches, self.cage.cut_mesh.vertex, points, criterion, max_rate, self.cage.source.name
-        )
+        return adaptive_table(self.patches, points, criterion, max_rate, self.cage.source.name)
 
     def tessellate(
         self,
@@ -556,11 +541,9 @@ class LimitSurface:
         positions, normals = self.sample_vertices(table, evaluator, dtype, sample_offset)
         attributes = self.attribute_table(table)
         values = {name: attribute_values.copy() for name, attribute_values in attributes.values.items()}
-        texcoords = values.pop(TEXCOORDS, None)
-        mesh = attributes.layout
-        return Tessellation(
-            mesh.gathered(positions), mesh.gathered(normals), mesh.triangles, table.element, texcoords, values
-        )
+        mesh, texcoords = attributes.layout, values.pop(TEXCOORDS, None)
+        vertices = mesh.gathered(positions), mesh.gathered(normals)
+        return Tessellation(*vertices, mesh.triangles, table.element, texcoords, values)
 
     def tessellation_matrix(self, table: int | VertexTable = 8) -> VertexMatrices:
         """Weights of the control points at the vertices of a tessellation, as sparse matrices.
@@ -578,7 +561,7 @@ class LimitSurface:
         """
         if not isinstance(table, VertexTable):
             table = self.sampling(table)
-        points, *tangents = self._matrices(*table.locations(), limit_stencils, 3)
+        points, *tangents = stencil_matrices(self.patches, *table.locations(), limit_stencils, 3)
         return VertexMatrices(points[table.weld_target], *tangents)
 
     def attribute_table(self, table: VertexTable, names: Iterable[str] | None = None) -> AttributeTable:
@@ -590,7 +573,7 @@ class LimitSurface:
             If the scheme has no rules for one of them.
         """
         channels = {name: self.channel(name) for name in (self.attribute_names if names is None else names)}
-        return AttributeTable.build(table, self.patches, self.cage.cut_mesh.vertex, channels)
+        return AttributeTable.build(table, self.patches, channels)
 
     def sample_vertices(
         self, table: VertexTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float

@@ -50,13 +50,9 @@ class PatchFrames:
     has_copies: bool  # Whether several edges or vertices of the topology have the same number
 
     @classmethod
-    def of(
-        cls,
-        patches: PatchTable,
-        control_of_vertex: IntArray,  # (n_v,) int64: 0-based control point at each mesh vertex
-    ) -> PatchFrames:
+    def of(cls, patches: PatchTable) -> PatchFrames:
         """The frames of a table's patches."""
-        t, is_split = patches.elements, patches.refined is not None
+        t, is_split, control_of_vertex = patches.elements, patches.refined is not None, patches.control_of_vertex
         is_whole = patches.is_whole & (not is_split)
         scale = np.where(patches.is_whole & is_split, 0.5, 1.0)
         half_edge = np.arange(t.half_edge_count, dtype=np.int32)
@@ -128,19 +124,10 @@ def in_patch(tiles: Tiles, tile: IntArray, uv: FloatArray) -> FloatArray:
     return parameters
 
 
-def half_edges_around(frames: PatchFrames, corner: IntArray) -> list[IntArray]:
-    """The half-edges around elements, in order from ``corner`` on, as many as the domain has corners."""
-    around = [corner]
-    for _ in range(1, frames.domain.corner_count):
-        around.append(frames.topology.next[around[-1]])
-    return around
-
-
 class Sides(NamedTuple):
-    """The lines on which sides of tiles lie: edges of elements, spokes of polygons, and lines inside patches.
+    """The lines on which sides of tiles lie, with an entry for each side, tile by tile.
 
-    A spoke joins the midpoint of an edge to the polygon's centre, and separates two patches at its corners. Arrays have
-    an entry for each side, tile by tile.
+    A spoke joins the midpoint of an edge to the polygon's centre, and separates two patches at its corners.
     """
 
     half_edge: IntArray  # (m t,) int32: half-edge of the element on whose edge the side lies, or -1
@@ -151,10 +138,7 @@ class Sides(NamedTuple):
     bits: int
 
     def at_vertices(self, corner_count: int) -> IndexArray:
-        """``(t, m)`` half-edge that begins at the vertex of the elements at each corner of tiles; -1 at other corners.
-
-        There, two successive sides lie on edges.
-        """
+        """``(t, m)`` half-edge that begins at the element's vertex at each corner of tiles; -1 at other corners."""
         half_edge = self.half_edge.reshape(-1, corner_count)
         return np.where(np.roll(half_edge, 1, axis=1) >= 0, half_edge, -1)
 
@@ -180,7 +164,7 @@ def sides_of(tiles: Tiles, frames: PatchFrames, bits: int) -> Sides:
         level[1] += begin[1]
     on_border = level == np.array([0, unit, 0] if m == 3 else [0, unit, unit, 0])[:, None]
     # The patch of a polygon's corner has parts of the edges that begin and end there, and of both spokes from these.
-    around = np.stack(half_edges_around(frames, corner))
+    around = np.stack(t.around_faces(corner, m))
     around[2:] = np.where(is_whole, around[2:], t.prev[corner])
     around[1] = np.where(is_whole, around[1], corner)
     on_edge = on_border & (is_whole | (side % 3 == 0)[:, None])
@@ -250,7 +234,7 @@ class AdaptiveGrid:
         return np.repeat(np.arange(self.side_counts.size, dtype=np.int32), self.side_counts.ravel())
 
     def _numbered(self, edge: IndexArray, vertex: IndexArray) -> tuple[IndexArray, IndexArray]:
-        """Number the samples on sides, equal points alike: those on edges and at vertices of equal numbers.
+        """Number the samples on sides, equal points, on edges and at vertices of equal numbers, alike.
 
         Returns the number of each sample, and the first sample of each number.
         """
@@ -275,7 +259,6 @@ class AdaptiveGrid:
 
     @cached_property
     def vertex_count(self) -> int:
-        """Vertices of the tessellation."""
         return len(self._numbers[1]) + int(self._inner_counts.sum())
 
     def copies(self) -> IntArray:
@@ -302,23 +285,19 @@ class AdaptiveGrid:
         """``(m,)`` element of each triangle."""
         return self.frames.topology.face[self.tiles["corner"]][self._tile()].astype(np.uint32)
 
+    @property
     def _triangle_counts(self) -> IntArray:
-        """``(t,)`` triangles of each tile, by Euler's formula."""
+        # By Euler's formula.
         return self.side_counts.sum(axis=1) + 2 * self._inner_counts - 2
 
     def _tile(self) -> IndexArray:
         """``(n,)`` tile of each triangle, in ascending order."""
-        return np.repeat(np.arange(len(self.tiles), dtype=np.int32), self._triangle_counts())
+        return np.repeat(np.arange(len(self.tiles), dtype=np.int32), self._triangle_counts)
 
     def _sample_triangles(self) -> IndexArray:
-        """``(n, 3)`` samples of each triangle. Samples on the sides of all tiles come first, then those inside tiles.
-
-        Computed at each call: the result is rarely needed twice, and would take memory as long as the grid exists.
-        """
-        on_sides, inside, begin = (
-            ragged.offsets(counts)
-            for counts in (self.side_counts.sum(axis=1), self._inner_counts, self._triangle_counts())
-        )
+        """``(n, 3)`` samples of each triangle, those on sides first; not kept, as it is rarely needed twice."""
+        counts_of_tiles = self.side_counts.sum(axis=1), self._inner_counts, self._triangle_counts
+        on_sides, inside, begin = map(ragged.offsets, counts_of_tiles)
         triangles = np.empty((int(begin[-1]), 3), dtype=np.int32)
         for block in chunks_of(len(self.tiles), self.side_counts.shape[1]):
             samples = slice(on_sides[block.start], on_sides[block.stop])
@@ -337,10 +316,7 @@ class AdaptiveGrid:
         return (self.position[samples] - begin) / (end - begin)
 
     def parameters(self, samples: IntArray | slice | None = None) -> tuple[IndexArray, FloatArray]:
-        """The tile of some samples on sides and of all inner ones, and their parameters ``(2, n)`` in its patch.
-
-        By default of the samples that number the vertices.
-        """
+        """Tiles and parameters ``(2, n)`` in patches of samples on sides, by default one a vertex, and inner ones."""
         samples = self._numbers[1] if samples is None else samples
         tile, side = np.divmod(self._side[samples], self.side_counts.shape[1])
         corners = self.frames.domain.corners
@@ -352,10 +328,7 @@ class AdaptiveGrid:
         return tile, in_patch(self.tiles, tile, np.concatenate([on_sides, inside], axis=1))
 
     def _seen(self, tile: IntArray, near: FloatArray, *points: FloatArray) -> tuple[IntArray, list[FloatArray]]:
-        """Locate points in elements, from parameters ``(2, n)`` in patches.
-
-        Returns the corners of the elements that are nearest to ``near``, and parameters ``(n, 2)`` that start there.
-        """
+        """The corners of elements nearest to ``near``, and ``(n, 2)`` parameters from there of points in patches."""
         frames, corner = self.frames, self.tiles["corner"][tile]
         face, domain = frames.topology.face[corner], frames.domain
         distances = [np.maximum(*np.abs(near - end[:, None])) for end in domain.corners]
@@ -366,14 +339,11 @@ class AdaptiveGrid:
                 turned = np.flatnonzero(turn == number)
                 uv[turned] = domain.rotation(number).inverse()(uv[turned])
             seen.append(uv * frames.scale[face][:, None])
-        return np.choose(turn, half_edges_around(frames, corner)), seen
+        return np.choose(turn, frames.topology.around_faces(corner, domain.corner_count)), seen
 
     @property
     def triangle_locations(self) -> tuple[IntArray, FloatArray]:
-        """Locate the corners of triangles; computed at each call, as kernels keep the result.
-
-        Returns a corner of an element, (m,) int32, and parameters in the element that start there, (m, 3, 2) float64.
-        """
+        """A corner of an element for each triangle, and parameters ``(m, 3, 2)`` from there; kernels keep them."""
         tile, (_, samples) = self._tile(), self.parameters(slice(None))
         middle = in_patch(self.tiles, tile, np.full((2, len(tile)), 1 / self.frames.domain.corner_count))
         corner, uv = self._seen(tile, middle, *(samples[:, column] for column in self._sample_triangles().T))
@@ -406,11 +376,8 @@ def _sampled_sides(tiles: Tiles, frames: PatchFrames) -> tuple[Sides, IndexArray
     return sides, counts.reshape(doublings.shape), position
 
 
-def _least_joined(
-    count: int,
-    pairs: IndexArray,  # (2, n)
-) -> IndexArray:
-    """``(count,)`` the least of all numbers that pairs join to each number, directly or through others."""
+def _least_joined(count: int, pairs: IndexArray) -> IndexArray:
+    """``(count,)`` the least number that pairs ``(2, n)`` join to each number, directly or through others."""
     least = np.arange(count, dtype=np.int32)
     while True:
         joined = least.copy()
@@ -422,10 +389,7 @@ def _least_joined(
 
 
 def _meets_twice(frames: PatchFrames) -> NDArray[np.bool_]:
-    """``(n_f,)`` whether two corners of each whole element are connected more than once.
-
-    Connections are edges, and diagonals of quadrilaterals, of any element.
-    """
+    """``(n_f,)`` whether two corners of each whole element are connected twice, by edges or by diagonals."""
     t, m = frames.topology, frames.domain.corner_count
     whole = np.flatnonzero(frames.is_whole)
     first = t.face_offsets[whole] + np.arange(m, dtype=np.int32)[:, None]

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
-from ..mesh.shared import Content, Shared
+from ..mesh.shared import Content, Shared, shared
 from ..patches.patch_table import PatchTable
 from ..schemes.domain import FloatArray
 from .uniform import uniform_table
@@ -22,30 +22,66 @@ if TYPE_CHECKING:
     from ..patches.channel import Channel, ChannelLayout
 
 
-@dataclass(frozen=True, eq=False)
 class AttributeLayout:
     """Triangles and vertex locations of a tessellation with attributes, independent of the attributes' values."""
 
-    # (n,) int64 or None: the vertex of the `VertexTable` whose position and normal each split vertex has. None without
-    # seams, when both tables have the same vertices.
-    surface_vertex: IntArray | None
-    find_triangles: Callable[[], NDArray[np.uint32]]  # Computes `triangles` on demand
-    # Computes the locations of split vertices, on the vertices' sides of seams; see `UniformGrid.locations`
-    locate: Callable[[], tuple[IntArray, FloatArray]]
-    # For each channel layout, the function that evaluates a channel at the vertices: ``(n, k)`` float64
-    evaluate: tuple[Callable[[Channel], FloatArray], ...] = ()
+    def __init__(
+        self,
+        table: VertexTable,
+        patches: PatchTable,  # That the table was built from
+        layouts: tuple[ChannelLayout, ...],
+    ) -> None:
+        self._table, self._patches, self._grid = table, patches, table.grid
+        # (n,) int64 or None: the vertex of the `VertexTable` whose position and normal each split vertex has. None
+        # without seams, when both tables have the same vertices.
+        self.surface_vertex: IntArray | None = None
+        # Tables of the meshes of channels, and the vertex there of each split vertex
+        self._tables: dict[ChannelLayout, tuple[VertexTable, IntArray]] = {}
+        if seams := [layout.seam for layout in layouts if layout.seam is not None]:
+            from ..mesh.cuts import cut_along_seams
+
+            # Only elements that are faces have seams. Cutting them along seams keeps their half-edges.
+            cut = cut_along_seams(patches.topology, np.any(seams, axis=0))
+            self._grid = table.grid.cut(PatchTable(cut.topology, patches.scheme, patches.is_hole).elements)
+            self.surface_vertex = self._grid.vertices_of(table.grid)
 
     @cached_property
     def triangles(self) -> NDArray[np.uint32]:
         """``(m, 3)``: the vertex table's triangles in the same order, each with its corners in the same order."""
-        return self.find_triangles()
+        return self._table.triangles if self.surface_vertex is None else self._grid.triangles()
+
+    @cached_property
+    def _locations(self) -> tuple[IntArray, FloatArray]:
+        return self._grid.locations()
+
+    def locate(self) -> tuple[IntArray, FloatArray]:
+        """The locations of split vertices, on the vertices' sides of seams; see `UniformGrid.locations`."""
+        return self._table.locations() if self.surface_vertex is None else self._locations
 
     def gathered(self, values: NDArray) -> NDArray:
         """Values at split vertices, from values at the vertices of the vertex table."""
         return values if self.surface_vertex is None else values[self.surface_vertex]
 
+    def evaluated(self, channel: Channel) -> FloatArray:
+        """``(n, k)`` float64 values of a channel, of one of the layouts, at the vertices."""
+        layout, table, grid = channel.layout, self._table, self._table.grid
+        if not layout.is_linear and layout.patches is self._patches:
+            values = _interpolated(table, channel)
+            values[table.copies[0]] = values[table.copies[1]]
+            return self.gathered(values)
+        if layout.is_linear or not isinstance(grid, UniformGrid):
+            return channel.evaluate(*self._locations)
+        if layout not in self._tables:
+            table = uniform_table(layout.patches, grid.rate)
+            self._tables[layout] = table, self._grid.vertices_of(table.grid)
+        table, vertices = self._tables[layout]
+        return _interpolated(table, channel)[vertices]
 
-_LAYOUTS: Shared[AttributeLayout] = Shared()
+
+def _interpolated(table: VertexTable, channel: Channel) -> FloatArray:
+    control_values = np.zeros((table.control_count, channel.values.shape[1]))
+    control_values[channel.layout.patches.control_of_vertex] = channel.values[channel.layout.value_index]
+    return table.interpolated(control_values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,61 +94,15 @@ class AttributeTable:
     values: Mapping[str, FloatArray]
 
     @classmethod
-    def build(
-        cls,
-        table: VertexTable,  # Of the tessellation
-        # The inputs that the table was built from
-        patches: PatchTable,
-        control_of_vertex: IntArray,
-        channels: Mapping[str, Channel],
-    ) -> AttributeTable:
+    def build(cls, table: VertexTable, patches: PatchTable, channels: Mapping[str, Channel]) -> AttributeTable:
         """Evaluate attributes in float64."""
         layouts = tuple(channel.layout for channel in channels.values())
-        layout = _LAYOUTS.get((table, *layouts), lambda: _layout(table, patches, control_of_vertex, layouts))
-        values = {}
-        for index, (name, channel) in enumerate(channels.items()):
-            key, evaluate = (layout, index, Content(channel.values)), partial(layout.evaluate[index], channel)
-            values[name] = _VALUES.get(key, evaluate)
+        layout, values = shared(AttributeLayout, table, patches, layouts), {}
+        for name, channel in channels.items():
+            key = layout, channel.layout, Content(channel.values)
+            values[name] = _VALUES.get(key, partial(layout.evaluated, channel))
             values[name].flags.writeable = False
         return cls(layout, values)
 
 
 _VALUES: Shared[FloatArray] = Shared()
-
-
-def _layout(
-    table: VertexTable, patches: PatchTable, control_of_vertex: IntArray, layouts: tuple[ChannelLayout, ...]
-) -> AttributeLayout:
-    """The layout of attributes with the given channel layouts at the vertices of a tessellation."""
-    # Only elements that are faces have seams. Cutting them along seams keeps their half-edges.
-    grid, surface_vertex = table.grid, None
-    seams = [layout.seam for layout in layouts if layout.seam is not None]
-    if seams:
-        from ..mesh.cuts import cut_along_seams
-
-        cut = cut_along_seams(patches.topology, np.any(seams, axis=0))
-        grid = grid.cut(PatchTable(cut.topology, patches.scheme, patches.is_hole).elements)
-        surface_vertex = grid.vertices_of(table.grid)
-    locate = cache(grid.locations)
-
-    def on_surface(channel: Channel) -> FloatArray:
-        # Without seams, and subdivided on the surface's mesh.
-        control_values = np.zeros((table.control_count, channel.values.shape[1]))
-        control_values[control_of_vertex] = channel.values[channel.layout.value_index]
-        vertex_values = table.interpolated(control_values)
-        vertex_values[table.copies[0]] = vertex_values[table.copies[1]]
-        return vertex_values if surface_vertex is None else vertex_values[surface_vertex]
-
-    def evaluate(layout: ChannelLayout) -> Callable[[Channel], FloatArray]:
-        if layout.patches is patches and not layout.is_linear:
-            return on_surface
-        if layout.is_linear or not isinstance(table.grid, UniformGrid):
-            return lambda channel: channel.evaluate(*locate())
-        channel_table = uniform_table(layout.patches, table.grid.rate)
-        vertices = grid.vertices_of(channel_table.grid)
-        return lambda channel: channel_table.interpolated(channel.values[channel.layout.value_index])[vertices]
-
-    evaluations = tuple(map(evaluate, layouts))
-    if not seams:
-        return AttributeLayout(None, lambda: table.triangles, table.locations, evaluations)
-    return AttributeLayout(surface_vertex, grid.triangles, locate, evaluations)

@@ -130,10 +130,7 @@ class Criterion:
         return self._relative(form, self.limit(points.min(axis=0), points.max(axis=0), normals))
 
     def form_of_displacement(self, points: FloatArray, heights: FloatArray, corner_count: int) -> FloatArray:
-        """``(3, t)`` contribution of a displacement to `form`, from its heights ``(n, n, t)`` over tiles, by v and u.
-
-        Heights that are not numbers lie outside a triangle, and do not count.
-        """
+        """``(3, t)`` contribution to `form` of heights ``(n, n, t)`` over tiles, by v and u; NaN beyond a triangle."""
         steps, is_triangle = len(heights) - 1, corner_count == 3
         u, v = (steps * np.diff(heights, axis=axis) for axis in (1, 0))
         if self.measure is Measure.EDGE and is_triangle:
@@ -163,7 +160,6 @@ class Criterion:
 
 
 def _edge_form(du: FloatArray, dv: FloatArray, corner_count: int) -> FloatArray:
-    """Bound of the squared length of edges, see `Criterion.form`."""
     if corner_count == 3:
         # Edges of strips cross at most two triangles of the grid.
         return _isotropic(4 * np.max([dot(d, d).max(axis=0) for d in (du, dv, du - dv)], axis=0))
@@ -173,7 +169,7 @@ def _edge_form(du: FloatArray, dv: FloatArray, corner_count: int) -> FloatArray:
 
 
 def _chord_form(second: list[FloatArray], shortest: FloatArray, normals: Cone, corner_count: int) -> FloatArray:
-    """Bound of the distance of triangles, see `Criterion.form`, from the least length of both tangents."""
+    """`Criterion.form` of the distance of triangles, from the least length of both tangents."""
     if corner_count == 3:
         second = _by_angle(*second)
     # The distance from the surface is the normal component of the difference, plus an excess due to its tangential
@@ -195,10 +191,7 @@ def _chord_form(second: list[FloatArray], shortest: FloatArray, normals: Cone, c
 
 
 def _by_angle(uu: FloatArray, uv: FloatArray, vv: FloatArray) -> list[FloatArray]:
-    """The second derivative along a direction in an equilateral triangle, by the direction's angle.
-
-    Returns its mean, and the factors of the cosine and the sine of twice the angle.
-    """
+    """Second derivatives by angle in an equilateral triangle: mean, factors of cosine and sine of twice the angle."""
     mean = (uu - uv + vv) * (2 / 3)
     return [mean, uu - mean, (uv - uu / 2) * (2 / sqrt(3))]
 
@@ -207,13 +200,10 @@ def _isotropic(values: FloatArray) -> FloatArray:
     return np.stack([values, np.zeros_like(values), np.zeros_like(values)])
 
 
-def least_product(
-    # (f, 3, t) float64: non-negative A, B and C of `f` forms
-    forms: FloatArray,
-) -> IntArray:
-    """Integer rates of least product with ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2 <= 1`` for all forms.
+def least_product(forms: FloatArray) -> IntArray:
+    """``(t, 2)`` rates of least product with ``A / n_u^2 + 2 B / (n_u n_v) + C / n_v^2 <= 1``.
 
-    Returns (t, 2) int64.
+    For all non-negative ``forms`` A, B and C, ``(f, 3, t)``.
     """
     forms = np.minimum(forms, MOST)
     # Where A and C vanish, the quotient below must not overflow.

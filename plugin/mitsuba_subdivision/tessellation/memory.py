@@ -29,7 +29,7 @@ def bytes_of_tessellation(patches: PatchTable, grid: UniformGrid) -> int:
     # A patch at a corner of an element has half the segments along each side.
     at_corner = (rate // 2 + 1) ** 2
     sample_count = 0
-    for patch_class in (patches if refined is None else refined.table).classes:
+    for patch_class in patches.evaluated.classes:
         is_whole = refined is None and patches.is_whole[patches.elements.face[patch_class.corners[:1]]][0]
         sample_count += in_whole if is_whole else at_corner
     return VERTEX_BYTES * grid.vertex_count + SAMPLE_BYTES * sample_count
@@ -74,10 +74,7 @@ def exceeded_limit(needed: float) -> int | None:
 def available_memory(
     root: str | Path = "/",  # Parent of the folders `proc` and `sys`
 ) -> int | None:
-    """Bytes that the process can still allocate: the least of the machine's, its control groups' and its own limit.
-
-    None if the system does not report it.
-    """
+    """Bytes that the machine, the process's control groups and its own limit leave; None if the system says nothing."""
     from pathlib import Path
 
     root = Path(root)
@@ -87,7 +84,7 @@ def available_memory(
 
 
 def _of_groups(root: Path) -> Iterator[int]:
-    """Memory left within the limit of each control group of the process, and of its ancestors."""
+    """Memory left within the limits of the process's control groups, and of their ancestors."""
     for line in _lines(root / "proc/self/cgroup"):
         _, controllers, path = line.split(":", 2)
         if controllers == "":

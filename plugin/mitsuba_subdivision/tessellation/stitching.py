@@ -75,11 +75,7 @@ def stitched(
     along: FloatArray,  # (n,) float64: as for `SideSamples`
     keeps_corner: NDArray[np.bool_],  # (t, m): corners of tiles with inner samples that no triangle may cut off
 ) -> IndexArray:
-    """Join the samples of tiles by triangles.
-
-    Returns the samples of each triangle, (n, 3) int32, tile by tile. Samples on the sides of all tiles are numbered
-    first, then inner samples.
-    """
+    """Triangles ``(n, 3)`` of the samples of tiles, tile by tile. Samples on sides are numbered before inner ones."""
     sides, m = SideSamples(side_counts, along), side_counts.shape[1]
     counts = inner_counts(rates, m)
     first_inner = len(along) + ragged.starts(counts)
@@ -114,10 +110,8 @@ def _strips(
     low, high = np.broadcast_to(least_before, strips.shape), right_counts - least_after
     passed = np.clip(passed, low[strip], high[strip])
     base = (first_left + strips)[strip] + place
-    on_left = (
-        np.stack([right[(first_right + strips)[strip] + passed], left[base + 1], left[base]], axis=1),
-        tiles[strip],
-    )
+    tips = right[(first_right + strips)[strip] + passed]
+    on_left = np.stack([tips, left[base + 1], left[base]], axis=1), tiles[strip]
     # The tip of a triangle on a right segment is the end of the last left segment before it.
     width = int(right_counts.max(initial=0)) + 1
     keys = width * strip + passed
@@ -130,7 +124,7 @@ def _strips(
 def _around_inner(
     rates: IntArray, sides: SideSamples, tiles: IntArray, first_inner: IntArray, is_cut: NDArray[np.bool_]
 ) -> Triangles:
-    """Triangles between the sides of tiles and the rim of their inner samples, and triangles that cut corners off.
+    """Triangles between the sides of tiles and the rim of their inner samples.
 
     Near a corner that is cut off, within a step of the grid, a strip joins the tile's two sides.
     """

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..mesh.shared import Content, Shared
+from ..mesh.shared import shared
 from ..patches.patch_table import PatchClass, PatchTable
 from ..schemes.domain import FloatArray
 from .memory import require_memory
@@ -21,38 +21,26 @@ from .vertex_table import VertexPolynomials, VertexRuns, VertexTable, vertex_pol
 MOST_VERTICES = ((1 << 32) - 1) // 6
 
 
-def uniform_table(
-    patches: PatchTable,
-    rate: int,  # Segments per edge, at least 1
-    # (n_v,) int64: 0-based control point at each mesh vertex. By default vertices are control points.
-    control_of_vertex: IntArray | None = None,
-    control_count: int | None = None,  # Number of control points. By default one for each mesh vertex.
-) -> VertexTable:
-    """Prepare the uniform tessellation of a cage's patches. Equal calls share the table while it is referenced.
+def uniform_table(patches: PatchTable, rate: int) -> VertexTable:
+    """Prepare the tessellation of a cage's patches with a number of segments per edge; equal calls share the table.
 
     Raises ValueError if the rate is no integer, below 1, or so high that there are more than MOST_VERTICES vertices.
     Raises MemoryError if the tessellation would not fit into memory.
     """
-    checked = checked_rate(rate)
-
-    def make() -> VertexTable:
-        grid = UniformGrid(patches.scheme.domain, patches.elements, checked)
-        if grid.vertex_count > MOST_VERTICES:
-            raise ValueError(
-                f"tessellation rate {checked} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, "
-                "whose triangles fit into a buffer"
-            )
-        require_memory(patches, grid)
-        count = control_count or patches.topology.vertex_count
-        control = np.arange(count) if control_of_vertex is None else control_of_vertex
-        controls, refinement = patches.control_rows(control, count)
-        polynomials, copies = _polynomials(patches, grid), _copies(patches, grid, control)
-        return VertexTable(count, patches.patch_count, grid, polynomials, controls, copies, refinement)
-
-    return _TABLES.get((patches, checked, Content(control_of_vertex), control_count), make)
+    return shared(_table, patches, checked_rate(rate))
 
 
-_TABLES: Shared[VertexTable] = Shared()
+def _table(patches: PatchTable, rate: int) -> VertexTable:
+    grid = UniformGrid(patches.scheme.domain, patches.elements, rate)
+    if grid.vertex_count > MOST_VERTICES:
+        raise ValueError(
+            f"tessellation rate {rate} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, whose "
+            "triangles fit into a buffer"
+        )
+    require_memory(patches, grid)
+    polynomials, (controls, refinement) = _polynomials(patches, grid), patches.control_rows()
+    counts = patches.control_count, patches.patch_count
+    return VertexTable(*counts, grid, polynomials, controls, _copies(patches, grid), refinement)
 
 
 def checked_rate(rate: int, name: str = "tessellation rate") -> int:
@@ -94,11 +82,10 @@ def _polynomials(patches: PatchTable, grid: UniformGrid) -> tuple[VertexPolynomi
 
 
 def _layouts(patches: PatchTable, grid: UniformGrid) -> Iterator[tuple[list[PatchClass], FloatArray, list[GridPart]]]:
-    """Iterate over the classes of whole elements and those of elements' corners, with their `UniformGrid.layout`."""
-    refined = patches.refined
+    """The classes of whole elements, and those of elements' corners, with their `UniformGrid.layout`."""
     by_wholeness: dict[bool, list[tuple[PatchClass, IntArray]]] = {True: [], False: []}
-    for patch_class in (patches if refined is None else refined.table).classes:
-        corners = patch_class.corners if refined is None else refined.corners(patch_class)
+    for patch_class in patches.evaluated.classes:
+        corners = patches.places(patch_class)
         # The first patch represents its class: all patches of a class lie in elements with the same number of corners,
         # which is the valence of the element's centre in the cage refined once.
         element = patches.elements.face[corners[:1]]
@@ -106,15 +93,12 @@ def _layouts(patches: PatchTable, grid: UniformGrid) -> Iterator[tuple[list[Patc
     for pairs in filter(None, by_wholeness.values()):
         classes, corners_of_class = zip(*pairs, strict=True)
         # A patch of the cage refined once covers only one corner of an element, even of a whole one.
-        yield [*classes], *grid.layout(np.concatenate(corners_of_class), are_corners=refined is not None)
+        yield [*classes], *grid.layout(np.concatenate(corners_of_class), are_corners=patches.refined is not None)
 
 
-def _copies(patches: PatchTable, grid: UniformGrid, control_of_vertex: IntArray) -> IntArray:
-    """`VertexTable.copies` at the corners of elements, then inside edges.
-
-    The border of the mesh consists of the boundary of the cage and the sides of its creases.
-    """
-    t = patches.elements
+def _copies(patches: PatchTable, grid: UniformGrid) -> IntArray:
+    """`VertexTable.copies` on the boundary of the cage and the sides of its creases: at corners, then inside edges."""
+    t, control_of_vertex = patches.elements, patches.control_of_vertex
     border = np.flatnonzero(t.twin < 0)
     if patches.scheme.element == "vertex" or not len(border):
         return np.empty((2, 0), dtype=np.int64)

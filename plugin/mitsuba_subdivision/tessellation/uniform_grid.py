@@ -42,9 +42,7 @@ class UniformGrid:
     An element that fits the domain is one grid with ``rate`` segments along each side. Any other polygon has a square
     grid at each of its corners, which reaches half way along the corner's two edges. For an even rate, these grids meet
     along spokes, which run from the midpoints of the edges to the polygon's centre. For an odd rate, strips of
-    triangles join them, and a fan of triangles closes the middle.
-
-    `AdaptiveGrid` has the members that `VertexTable` asks for as well.
+    triangles join them, and a fan of triangles closes the middle. `AdaptiveGrid` has the same members.
     """
 
     def __init__(
@@ -62,11 +60,8 @@ class UniformGrid:
         # Steps from a corner of a polygon to samples inside its grid: for an even rate, the last one is on a spoke.
         self._inside = np.arange(1, self._half + self._is_odd)
 
-    # Numbers of vertices
-
     @cached_property
     def vertex_count(self) -> int:
-        """Vertices of the tessellation."""
         return self.inner_begin + int(self._inner_counts.sum())
 
     @cached_property
@@ -104,10 +99,7 @@ class UniformGrid:
         return self.inner_begin + ragged.starts(self._inner_counts)
 
     def along(self, corners: IntArray, steps: IntArray) -> NDArray[np.uint32]:
-        """Vertices ``steps`` segments along the edges that begin at corners: ``(*corners.shape, len(steps))``.
-
-        Steps 0 and ``rate`` are the ends of the edge.
-        """
+        """Vertices ``steps``, 0 to ``rate``, along edges that begin at corners: ``(*corners.shape, len(steps))``."""
         # Corners are the last axis, as there are more corners than steps, and NumPy's inner loops should be long.
         step = steps.astype(np.uint32).reshape(-1, *[1] * corners.ndim)
         numbers = np.where(self._are_lowest(corners), step - 1, self.rate - 1 - step)
@@ -161,8 +153,6 @@ class UniformGrid:
         t, face, n = self.topology, self.topology.face[corners], len(self._inside)
         return self.inner_start[face] + 1 + t.face_sizes[face] * n**2 + (corners - t.face_offsets[face]) * n
 
-    # Samples of whole elements
-
     @cached_property
     def _steps(self) -> IntArray:
         """``(S, 2)`` grid indices along u and v of the samples of a whole element, u fastest."""
@@ -185,13 +175,6 @@ class UniformGrid:
         ends = zip(self.domain.corners, np.roll(self.domain.corners, -1, axis=0), strict=True)
         along = np.arange(self.rate + 1)[:, None]
         return [self._sample_at(self.rate * begin + along * (end - begin)) for begin, end in ends]
-
-    def _turned_inside(self, turn: int) -> IntArray:
-        """Samples inside a whole element, in the order of their numbers, if the patch begins at corner ``turn``."""
-        uv = self._steps[self._is_inside] / self.rate
-        return self._sample_at(self.rate * self.domain.rotation(turn).inverse()(uv))
-
-    # Triangles
 
     @cached_property
     def triangle_counts(self) -> IntArray:
@@ -235,8 +218,7 @@ class UniformGrid:
     def _corner_cells(self) -> IntArray:
         """``(T, 3)`` samples at the corners of each triangle of one corner of a polygon.
 
-        Samples are those of the corner's grid, then the last row of the next corner's grid, which a strip across the
-        midpoint of the common edge joins for an odd rate, and the polygon's centre.
+        Samples are the corner's grid; the next corner's last row, which a strip joins for an odd rate; and the centre.
         """
         count = self._half + 1
         cells, beyond = _cut_cells(count, count), count**2 + np.arange(count)
@@ -246,10 +228,9 @@ class UniformGrid:
         return np.concatenate([cells, strip[_cut_cells(count, 2)], [[count**2 - 1, beyond[-1], beyond[-1] + 1]]])
 
     def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
-        """``(T, 3, 2)`` parameters at the corners of a whole element's triangles, which start at its first corner.
+        """``(T, 3, 2)`` parameters of a whole element's triangles, and of those of one corner of another, from there.
 
-        And those of one corner of any other element, which start at that corner. Some triangles may reach beyond u = 1,
-        into the patch of the next corner.
+        Some of these may reach beyond u = 1, into the patch of the next corner.
         """
         whole = (self._steps / self.rate)[self._whole_cells]
         if self.domain.corner_count == 3:
@@ -272,15 +253,12 @@ class UniformGrid:
         repeats = counts[0] if (counts == counts[0]).all() else counts
         return np.repeat(np.arange(self.topology.face_count, dtype=np.uint32), repeats)
 
-    # Grids of patches
-
     def layout(self, corners: IntArray, *, are_corners: bool = False) -> tuple[FloatArray, list[GridPart]]:
         """The grids of the patches that begin at ``corners``, which are all in whole elements or all not.
 
-        ``are_corners`` tells that whole elements have patches at their corners, too, which meet at their centres.
-        Returns the parameters of a patch's samples, ``(S, 2)``, starting at the corner at which the patch begins; and
-        parts that together contain every vertex that these patches evaluate exactly once. Patches are numbered in the
-        order of ``corners``.
+        With ``are_corners``, whole elements have patches at their corners, too, which meet at their centres. Returns
+        the parameters of a patch's samples, ``(S, 2)``, starting at the corner at which the patch begins; and parts
+        that together have every vertex that the patches, in the order of ``corners``, evaluate, once.
         """
         t, r = self.topology, self.rate
         face = t.face[corners]
@@ -288,7 +266,9 @@ class UniformGrid:
         if are_corners or not is_whole:
             return self._corner_layout(corners, turns, is_whole)
         uv, parts = self._steps / r, []
-        inside = [self._turned_inside(turn) for turn in range(self.domain.corner_count)]
+        # Samples inside, in the order of their numbers, of patches that begin at each corner.
+        turns_of_patch, uv_inside = range(self.domain.corner_count), uv[self._is_inside]
+        inside = [self._sample_at(r * self.domain.rotation(turn).inverse()(uv_inside)) for turn in turns_of_patch]
         for turn, samples in enumerate(inside):
             patches = np.flatnonzero(turns == turn)
             first, begin = self.inner_start[face[patches]], t.face_offsets[face[patches]]
@@ -304,7 +284,6 @@ class UniformGrid:
         samples: IntArray,  # samples of a patch from these corners along the edges
         along: FloatArray,  # parameters of these samples along the edge
     ) -> list[GridPart]:
-        """The part of the samples inside edges, and that of the sample at the corners."""
         uv, steps = np.stack([along, np.zeros_like(along)], axis=1), np.arange(len(samples))
         at_edge = np.flatnonzero(self._are_lowest(corners))
         at_vertex = np.flatnonzero(self.topology.vertex_half_edge[self.topology.face_vertices[corners]] == corners)
@@ -315,10 +294,7 @@ class UniformGrid:
         ]
 
     def _corner_layout(self, corners: IntArray, turns: IntArray, is_whole: bool) -> tuple[FloatArray, list[GridPart]]:
-        """`layout` of patches that lie at single corners of elements.
-
-        A patch reaches half way along its corner's two edges, and to the element's centre, which is (1, 1).
-        """
+        """`layout` of patches at corners, which reach half way along two edges, and to the centre at (1, 1)."""
         t, r, count, grid = self.topology, self.rate, self._half + 1, self._corner_parameters
         # The element's centre is an additional sample after the grid. For an even rate, some samples of the grid are
         # evaluated otherwise: the last row, with the midpoint of the preceding edge, by the preceding corner's patch,
@@ -353,10 +329,7 @@ class UniformGrid:
         return uv, [part._replace(uv=part.uv / 2) for part in parts]
 
     def locations(self) -> tuple[IntArray, FloatArray]:
-        """Locations of the vertices on the surface: half-edges of `PatchTable.elements`, and parameters ``(n, 2)``.
-
-        At the corner of an element at which a half-edge begins, parameters are (0, 0).
-        """
+        """Locations of the vertices: half-edges of `PatchTable.elements`, and parameters ``(n, 2)`` from there."""
         t = self.topology
         half_edge, uv = np.zeros(self.vertex_count, dtype=np.int64), np.zeros((self.vertex_count, 2))
         for corners in (t.face_offsets[:-1][self._is_whole], t.half_edges_of(~self._is_whole)):
@@ -366,13 +339,8 @@ class UniformGrid:
                 uv[vertices] = part.uv
         return half_edge, uv
 
-    # Other grids
-
     def cut(self, topology: Topology) -> UniformGrid:
-        """The same triangles over elements with the same half-edges, cut along more edges.
-
-        Vertices on a cut have a copy on each side, which is located on that side.
-        """
+        """The same triangles over elements cut along more edges, where vertices have a copy on each side."""
         return UniformGrid(self.domain, topology, self.rate)
 
     def vertices_of(self, other: Any) -> IntArray:
@@ -386,7 +354,7 @@ class UniformGrid:
 
 
 def _cut_cells(rows: int, columns: int) -> IntArray:
-    """Triangles of a grid of ``rows x columns`` vertices, as indices into it: ``(cells * 2, 3)``.
+    """``(cells * 2, 3)`` triangles of a grid of ``rows x columns`` vertices.
 
     Diagonals start at the grid's corners and do not cut these off: two grids that meet in two edges, at a vertex of
     valence 2, would both have the same triangle there.
@@ -400,17 +368,15 @@ def _cut_cells(rows: int, columns: int) -> IntArray:
 
 
 def _slices(indices: IntArray, size: int) -> Iterator[IntArray]:
-    """Split indices, each of which represents ``size`` vertices, into slices of about `VERTICES_AT_ONCE` vertices."""
+    """Split indices, of ``size`` vertices each, into slices of about `VERTICES_AT_ONCE` vertices."""
     length = max(1, VERTICES_AT_ONCE // size)
-    for begin in range(0, len(indices), length):
-        yield indices[begin : begin + length]
+    return (indices[begin : begin + length] for begin in range(0, len(indices), length))
 
 
 def first_sides(topology: Topology, border: IntArray, start: IntArray) -> IntArray:
-    """The first of the half-edges ``border`` that join the same points as each of them, as the sides of a crease do.
+    """The first of the half-edges ``border`` that joins the same points as each of them, as the sides of a crease do.
 
-    ``start``, ``(n_h,)``, is the point at which half-edges begin. The sides run in opposite directions; there may be
-    more of them where the cage is not a manifold.
+    ``start``, ``(n_h,)``, is the point at which half-edges begin.
     """
     ends = np.stack([start[border], start[topology.next[border]]]).astype(np.int64)
     pairs = ends.min(axis=0) * (int(start.max(initial=0)) + 1) + ends.max(axis=0)

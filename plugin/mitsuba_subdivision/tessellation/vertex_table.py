@@ -37,11 +37,7 @@ PATCHES_TOGETHER = 1 << 7
 
 @dataclass(frozen=True, eq=False)
 class VertexTable:
-    """A tessellation: its vertices as points on polynomials, its triangles, and their elements.
-
-    A polynomial's coefficients are weights times the control points of a patch. Weights do not depend on the positions
-    of control points; the triangles of an adaptive tessellation do.
-    """
+    """A tessellation: its vertices as points on polynomials, whose weights no positions change, and its triangles."""
 
     control_count: int
     patch_count: int
@@ -80,15 +76,8 @@ class VertexTable:
         """Location of each vertex on the surface, see `UniformGrid.locations`."""
         return self.grid.locations()
 
-    def apply(
-        self,
-        control_points: FloatArray,  # (control_count, 3) float64
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Evaluate every vertex.
-
-        Returns positions and normals, (vertex_count, 3) float64. Normals are zero where undefined, see
-        `SurfaceSamples`.
-        """
+    def apply(self, control_points: FloatArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions and normals of all vertices, ``(vertex_count, 3)``; normals as those of `SurfaceSamples`."""
         positions, normals = (np.empty((self.vertex_count, 3)) for _ in range(2))
         for vertex, vertex_points, vertex_normals in self._evaluated(control_points, with_normals=True):
             positions[vertex], normals[vertex] = vertex_points, vertex_normals
@@ -105,7 +94,6 @@ class VertexTable:
     def _evaluated(
         self, control_points: FloatArray, *, with_normals: bool
     ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
-        """`VertexPolynomials.evaluated`, of all polynomials."""
         # Refined control points are rounded before another one is subtracted.
         least_extent = 0.0 if self.refinement is None else LEAST_EXTENT[64]
         points = control_points if self.refinement is None else self.refinement @ control_points
@@ -117,11 +105,9 @@ class VertexTable:
 class VertexPolynomials:
     """Vertices on polynomials with the same monomials.
 
-    A *block* is a matrix of weights. Times the control points of a patch, it gives the coefficients of a polynomial.
-    There is a polynomial for each block, and each patch of the block's class that has vertices on it.
-
-    A run has vertices on one polynomial. All runs of a kind have vertices at the same parameters. An entry is one
-    vertex of a kind.
+    A *block* is a matrix of weights. Times the control points of a patch of its class, it gives the coefficients of a
+    polynomial. A run has vertices on one polynomial. All runs of a kind have vertices at the same parameters. An entry
+    is one vertex of a kind.
     """
 
     powers: IntArray  # (m, 2) int64: exponents of the monomials in parameters from the middle of the domain
@@ -149,10 +135,7 @@ class VertexPolynomials:
         *,
         with_normals: bool,
     ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
-        """Evaluate all vertices, in runs: numbers ``(n,)``, points ``(n, k)`` and, if asked for, normals ``(n, 3)``.
-
-        Normals are zero where the surface has none.
-        """
+        """Evaluate all vertices, in runs: numbers ``(n,)``, points ``(n, k)`` and, if asked for, normals ``(n, 3)``."""
         monomials = monomial_values(self.powers, self.st)[: 3 if with_normals else 1]
         # In ascending order.
         control_counts, first_block = self.blocks[self.block, 2], 0
@@ -185,7 +168,7 @@ class VertexPolynomials:
             first_block += len(weights)
 
     def _vertices(self, polynomials: slice) -> tuple[IntArray, IntArray, IntArray]:
-        """Polynomial (0-based in the slice), vertex and entry of each vertex on a slice of polynomials."""
+        """Polynomial, 0-based in the slice, of each vertex there; its number; and its entry."""
         first_run = self.first_run[polynomials.start : polynomials.stop + 1]
         runs = slice(int(first_run[0]), int(first_run[-1]))
         kind = self.kind[runs]
@@ -197,10 +180,7 @@ class VertexPolynomials:
 
 
 class VertexRuns(NamedTuple):
-    """The vertices of a tessellation, in runs: samples of one patch.
-
-    All runs of a kind have the same samples and offsets, on different patches of one class.
-    """
+    """The vertices of a tessellation, in runs: samples of one patch. All runs of a kind have the same, in one class."""
 
     patch_class: IntArray  # (k,): index of the class of each kind
     counts: IntArray  # (k,): number of samples of each kind
@@ -214,10 +194,7 @@ class VertexRuns(NamedTuple):
 def vertex_polynomials(
     scheme: Scheme, classes: Sequence[PatchClass], uv: Sequence[FloatArray], runs: VertexRuns
 ) -> tuple[VertexPolynomials, ...]:
-    """Find the polynomials on which vertices lie: planes, and polynomials of the scheme's basis, if there are any.
-
-    ``uv`` are the samples ``(s, 2)`` of each class.
-    """
+    """Find the polynomials on which vertices lie: planes, and the scheme's, from the samples ``(s, 2)`` of classes."""
     # Without unused classes: at low rates, patches of other classes may evaluate all samples of a class. Sorted by the
     # size of one-rings.
     used = np.unique(runs.patch_class).tolist()
@@ -270,11 +247,13 @@ def _of_form(
     order = np.argsort(keys, kind="stable")
     first_run = np.flatnonzero(np.diff(keys[order], prepend=-1))
     first = order[first_run]
+    magnitude, bounds = np.concatenate([np.abs(part).sum(axis=2) for part in weights]), np.zeros(len(blocks))
+    np.maximum.at(bounds, block, (np.abs(monomial_values(powers, st)[1:]) * magnitude[block].T).sum(axis=1).max(axis=0))
     return VertexPolynomials(
         powers,
         weights,
         blocks,
-        _tangent_weights(powers, weights, block, st),
+        bounds,
         run_block[first].astype(np.int32),
         patch[first].astype(np.int32),
         np.append(first_run, len(keys)),
@@ -284,15 +263,6 @@ def _of_form(
         runs.offsets[entry].astype(np.int32),
         st,
     )
-
-
-def _tangent_weights(powers: IntArray, weights: tuple[FloatArray, ...], block: IntArray, st: FloatArray) -> FloatArray:
-    """`VertexPolynomials.tangent_weights`, from the block and the parameters of each entry."""
-    magnitude = np.concatenate([np.abs(block_weights).sum(axis=2) for block_weights in weights])
-    entry_bounds = (np.abs(monomial_values(powers, st)[1:]) * magnitude[block].T).sum(axis=1).max(axis=0)
-    bounds = np.zeros(len(magnitude))
-    np.maximum.at(bounds, block, entry_bounds)
-    return bounds
 
 
 class VertexMatrices(NamedTuple):
