@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
@@ -36,6 +37,11 @@ _EMPTY = {"N": 1, **{f"{prefix}{name}": NOTHING for prefix in ("", _OF_PROBE) fo
 _GIT_LFS = b"version https://git-lfs"
 _MAGIC = b"\x76\x2f\x31\x01"
 _quieting = threading.Lock()
+
+
+def without_sample_counts(sampler: str) -> str:
+    """The description of a sampler without its numbers of samples, which renders change."""
+    return re.sub(r"\s*\b(sample_count|samples_per_wavefront|wavefront_size) = \d+", "", sampler)
 
 
 @dataclass(frozen=True, eq=False)

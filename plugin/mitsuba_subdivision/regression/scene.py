@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..messages import timed
 from . import RegressionError
+from .image import without_sample_counts
 
 BOX = "box"
 
@@ -49,10 +50,9 @@ class LoadedScene:
 
     @property
     def sampler(self) -> str:
-        """Kind and options of the sampler, without its number of samples."""
-        kind, *options = str(self.sensor.sampler()).replace("[", "\n").splitlines()
-        kept = [option.strip(" ,]") for option in options if "sample_count" not in option]
-        return " ".join([kind.strip(), *filter(None, kept)])
+        """Kind and options of the sampler, without its numbers of samples."""
+        kind, *options = without_sample_counts(str(self.sensor.sampler())).replace("[", " ").splitlines()
+        return " ".join([kind.strip(), *filter(None, (option.strip(" ,]") for option in options))])
 
     def channel_names(self, count: int) -> tuple[str, ...]:
         """Names of as many channels as an image of the scene has: R, G, B, A and AOVs."""

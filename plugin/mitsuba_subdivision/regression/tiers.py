@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import RegressionError
-from .image import Estimate, Image
+from .image import Estimate, Image, without_sample_counts
 
 __all__ = ["DEFAULT_TIERS", "TIERS", "Status", "TierResult", "Tolerances"]
 
@@ -283,6 +283,10 @@ def _different_samples(reference: Image, test: Image) -> str | None:
         return f"the {silent[0]} does not say with which seed its first batch was rendered"
     keys = [*_SAME_SAMPLES, *(key for key in _IF_KNOWN if key in reference.metadata and key in test.metadata)]
     wanted, given = ({key: image.metadata.get(key) for key in keys} for image in (reference, test))
+    for described in (wanted, given):
+        # Older references have the sampler's numbers of samples, too.
+        if sampler := described.get("sampler"):
+            described["sampler"] = without_sample_counts(sampler)
     different = _differences(wanted, given)
     if different:
         return f"the samples are not the same: {'; '.join(different)}"
