@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from mitsuba_subdivision.cage import CageContents
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from mitsuba_subdivision.mitsuba_mesh import CurveSet
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +117,7 @@ class MaterialContents:
 
 @dataclass(frozen=True, eq=False)
 class ShapeContents:
-    """A mesh, or those faces of a mesh that have one material."""
+    """A mesh, those faces of a mesh that have one material, or curves."""
 
     name: str  # Path of the prim
     cage: CageContents  # In the prim's own space. Without a scheme, it is a polygon mesh.
@@ -126,6 +129,7 @@ class ShapeContents:
     # (n,) int: faces with this material, of a limit surface that is evaluated whole; None for all. Parts of polygon
     # meshes and of large surfaces have the other faces as holes.
     shown_faces: NDArray | None = None
+    curves: CurveSet | None = None  # In the prim's own space; then the cage has their points in USD, and no faces
 
 
 @dataclass(frozen=True, eq=False)

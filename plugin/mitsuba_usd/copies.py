@@ -27,7 +27,7 @@ LEAST_INSTANCES = 64
 # of the memory. Each takes 3 ms of a picture.
 LARGE = 10_000
 # Of copies as one mesh, measured; and what they may take of the memory of the machine, and at most.
-FACE_BYTES, TRIANGLE_BYTES = {"exact": 600, "vertex": 300}, 170
+FACE_BYTES, TRIANGLE_BYTES, POINT_BYTES = {"exact": 600, "vertex": 300}, 170, 400
 MOST_PART, MOST_BYTES = 0.75, 6e9
 # Of a picture of so many instances, whose time grows with the square of their number.
 MEASURED_INSTANCES, MEASURED_SECONDS = 2_000, 65
@@ -130,6 +130,7 @@ def _bytes(rates: Mapping[ShapeContents, IntArray], most: int, shading: str) -> 
         corners, faces = int(cage.face_sizes.sum()), len(cage.face_sizes)
         squares = float(np.square(np.minimum(of_copies, most)).sum())
         triangles = corners * squares / 2 if is_smooth else (corners - 2 * faces) * count
+        total += POINT_BYTES * count * (0 if shape.curves is None else len(shape.curves.points))
         total += TRIANGLE_BYTES * triangles + (FACE_BYTES[shading] * faces * count if is_smooth else 0)
     return total
 
@@ -162,7 +163,9 @@ def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> S
         source=CageSource(f"{cage.source.name}, {count} copies"),
     )
     shown = None if shape.shown_faces is None else (shape.shown_faces + face).ravel()
-    return replace(shape, name=name, cage=copied, to_world=np.eye(4), normals=normals, shown_faces=shown)
+    curves = shape.curves and shape.curves.placed(matrices)
+    changed = replace(shape, name=name, cage=copied, to_world=np.eye(4), normals=normals, curves=curves)
+    return replace(changed, shown_faces=shown)
 
 
 def _attribute(given: Attribute, corners: IntArray) -> Attribute:

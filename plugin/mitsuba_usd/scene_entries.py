@@ -82,6 +82,8 @@ def scene_entries(
         material, of_shape = shape.material, (chosen or {}).get(shape, parameters)
 
         def entry(with_bsdf: SceneNode) -> SceneNode:
+            if shape.curves is not None:
+                return shape.curves.placed(shape.to_world[None]).entry(shape.cage.attributes, with_bsdf)
             if shape.cage.scheme is None:
                 return {**polygon_mesh(shape).entry(with_bsdf, area), **interior(material)}
             return subdivision(shape, surfaces, with_bsdf, area, {**of_shape, **interior(material)}, notes)
@@ -100,6 +102,8 @@ def scene_entries(
         shining = None if shape.radiance is None else rgb(shape.radiance)
         if shining is None and shape.material is not None:
             shining = radiance(shape.material, textures, notes)
+        if shining is not None and shape.curves is not None:
+            notes.add("emission of curves is ignored; Mitsuba's curves are no lights", shape.name)
         area = None if shining is None else {"type": "area", "radiance": shining}
         try:
             return made(shape, area)

@@ -354,12 +354,12 @@ def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(s
     shown["bilinear"] = 'uniform token subdivisionScheme = "bilinear"'
     text = "".join(mesh(name, CUBE, line) for name, line in {**hidden, **shown}.items())
     text += mesh("broken", CUBE.replace("5]", "50]")) + prim("Scope", "off", invisible, mesh("below", CUBE))
-    text += "".join(prim("BasisCurves", f"c{n}") for n in range(5))
+    text += "".join(prim("Points", f"c{n}") for n in range(5))
     entries, messages = told(scene, text)
     assert {*hidden, *shown, "broken", "off_below"} & entries.keys() == {*shown}
     expected = (
         "draw modes of models are ignored; their meshes are shown (/rendered)",
-        "BasisCurves are ignored (/c0, /c1, /c2 and 2 more)",
+        "Points are ignored (/c0, /c1, /c2 and 2 more)",
         "scheme bilinear become polygons (/bilinear)",
         "/broken...; the prim is left out",
     )
