@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from mitsuba_subdivision.cage import CageContents
@@ -180,6 +180,20 @@ class CameraContents:
     focus_distance: float
     shutter: list[float]  # When it opens and closes, in time codes after the time
     conform_policy: str = "expandAperture"  # For pictures of another aspect ratio; see `sensors.film_window`
+    mitsuba: dict[str, Any] = field(default_factory=dict)  # Parameters of Mitsuba's sensor that the prim states
+
+
+@dataclass(frozen=True, eq=False)
+class PictureContents:
+    """Render settings of a stage, with those of its first render product."""
+
+    resolution: list[int] | None = None
+    window: list[float] | None = None  # Least x and y, then largest, of what is rendered of the picture: y points up
+    is_transparent: bool = False  # Whether pictures have alpha
+    spp: int | None = None  # Samples per pixel
+    integrator: dict[str, Any] = field(default_factory=dict)  # Parameters of Mitsuba's integrator
+    aovs: dict[str, str] = field(default_factory=dict)  # Types of Mitsuba's AOVs, by the names of their variables
+    products: dict[str, list[str]] = field(default_factory=dict)  # Names of AOVs of products; "" is the colour
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,8 +206,7 @@ class SceneContents:
     instances: list[InstanceContents] = field(default_factory=list)
     lights: list[LightContents] = field(default_factory=list)
     camera: CameraContents | None = None
-    resolution: list[int] | None = None
-    is_transparent: bool = False  # Whether render settings ask for pictures with alpha
+    picture: PictureContents = field(default_factory=PictureContents)
 
     @property
     def all_shapes(self) -> list[ShapeContents]:

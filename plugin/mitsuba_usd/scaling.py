@@ -7,6 +7,7 @@ if that is more. So much of a thing of a hundredth of a unit is a hundredth of i
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from mitsuba_subdivision.mitsuba_mesh import box_corners, points_at
@@ -14,6 +15,7 @@ from mitsuba_subdivision.mitsuba_mesh import box_corners, points_at
 from .contents import CameraContents, LightContents, MaterialContents, SceneContents, ShapeContents
 
 _WITHOUT_PLACE = ("distant", "dome")
+_LENGTHS = ("near", "far", "lens_radius", "focus_distance")
 
 
 def size_of(contents: SceneContents) -> float:
@@ -62,13 +64,6 @@ def scaled_camera(camera: CameraContents, factor: float) -> CameraContents:
     to_world = camera.to_world.copy()
     to_world[:3, 3] *= factor
     film = 1.0 if camera.is_perspective else factor
-    return replace(
-        camera,
-        to_world=to_world,
-        aperture=[film * length for length in camera.aperture],
-        offset=[film * length for length in camera.offset],
-        near=factor * camera.near,
-        far=factor * camera.far,
-        lens_radius=factor * camera.lens_radius,
-        focus_distance=factor * camera.focus_distance,
-    )
+    changed: dict[str, Any] = {name: factor * getattr(camera, name) for name in _LENGTHS}
+    changed |= {name: [film * length for length in getattr(camera, name)] for name in ("aperture", "offset")}
+    return replace(camera, to_world=to_world, **changed)

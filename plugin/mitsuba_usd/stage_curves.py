@@ -25,14 +25,11 @@ BASES: dict[str, NDArray[np.float64]] = {
     "bspline": np.array([[1.0, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6,
     "catmullRom": np.array([[0.0, 2, 0, 0], [-1, 0, 1, 0], [2, -5, 4, -1], [-1, 3, -3, 1]]) / 2,
 }
-_WRAPS = ("nonperiodic", "periodic", "pinned")
-# Sine of the largest angle between segments that meet without a visible gap in their tubes.
-_STRAIGHT = 1e-3
-# Largest ratio of lengths that a transform without distortion has, by rounding.
-_EVEN = 1.001
-# Places along each segment, in the middles of equal parts, at which colours are sampled.
-_PLACES = (np.arange(8) + 0.5) / 8
-_NO_FACES: IntArray = np.zeros(0, np.int64)
+# Sine of the largest angle between segments whose tubes meet without a visible gap, and the largest ratio of lengths
+# of a transform without distortion.
+_STRAIGHT, _EVEN = 1e-3, 1.001
+# Parameters along each segment at which colours are sampled.
+_PLACES = (np.arange(8)[:, None] + 0.5) / 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,14 +62,13 @@ class CurveTopology:
 
     def has(self, size: int, interpolation: str) -> bool:
         """Whether there are so many values with an interpolation."""
-        sizes = {"constant": [1], "uniform": [len(self.counts)], "vertex": [self.counts.sum()]}
-        return size in sizes.get(interpolation, [ends.sum() for ends in self._ends])
+        sizes = {"constant": 1, "uniform": len(self.counts), "vertex": self.counts.sum(), "varying": self._ends.sum()}
+        return size == sizes.get(interpolation)
 
     @property
-    def _ends(self) -> list[IntArray]:
-        """Numbers ``(n,)`` of varying values of curves, by the documentation of USD and by its library."""
-        closed = self.wrap == "periodic"
-        return [self.segments + (not closed), self.segments + 1 - 2 * self._added]
+    def _ends(self) -> IntArray:
+        """Number of ends of segments of each curve, ``(n,)``."""
+        return self.segments + (self.wrap != "periodic")
 
     def powers(self, values: NDArray[np.float64], interpolation: str) -> NDArray[np.float64]:
         """Coefficients ``(n_s, 2 or 4, k)`` of powers of the parameter, along each segment, of values ``(m, k)``."""
@@ -81,12 +77,7 @@ class CurveTopology:
             return np.asarray(basis @ self._controls(values, self._step * number + np.arange(len(basis)) - self._added))
         row = np.repeat(self._curve[:, None], 2, axis=1) * (interpolation == "uniform")
         if interpolation == "varying":
-            ends = next(ends for ends in self._ends if ends.sum() == len(values))
-            # The library has no values for the points that are added.
-            row = number + np.arange(2) - (ends < self.segments)[self._curve, None] * self._added
-            last = ends[self._curve, None] - 1
-            row = row % (last + 1) if self.wrap == "periodic" else np.clip(row, 0, last)
-            row += ragged.starts(ends)[self._curve, None]
+            row = ragged.starts(self._ends)[self._curve, None] + (number + np.arange(2)) % self._ends[self._curve, None]
         powers = np.zeros((len(row), len(basis), values.shape[1]))
         powers[:, :2] = BASES["linear"] @ values[row]
         return powers
@@ -97,23 +88,22 @@ class CurveTopology:
         if self.wrap == "periodic":
             return values[first + index % (last + 1)]
         inside = np.clip(index, 0, last)
-        mirrored = np.clip(2 * inside - index, 0, last)
         # An added point lies as far beyond an end as the next point lies before it.
-        return np.where((index == inside)[..., None], 1, 2) * values[first + inside] - np.where(
-            (index == inside)[..., None], 0, values[first + mirrored]
-        )
+        beyond = values[first + inside] - values[first + np.clip(2 * inside - index, 0, last)]
+        return values[first + inside] + (index != inside)[..., None] * beyond
 
     def curve_set(self, points: NDArray[np.float64], radii: NDArray[np.float64], interpolation: str) -> CurveSet:
         """The curves, with points ``(m, 3)`` and radii ``(k, 1)``."""
         powers = np.concatenate([self.powers(points, "vertex"), self.powers(radii, interpolation)], axis=2)
-        order = powers.shape[1]
-        controls = np.linalg.solve(BASES["linear" if order == 2 else "bspline"], powers)
-        # Segments share points if they are those of a spline; then each adds its last point to those before.
-        is_spline = order == 2 or (self.basis == "bspline" and interpolation != "varying")
+        is_linear = self.basis == "linear"
+        controls = np.linalg.solve(BASES["linear" if is_linear else "bspline"], powers)
+        # Segments of a spline share points: each adds its last one to those before.
+        is_spline = is_linear or (self.basis == "bspline" and interpolation != "varying")
         is_new = np.full(controls.shape[:2], not is_spline)
         is_new[:, -1] = is_new[ragged.index_in_row(self.segments) == 0] = True
+        order = controls.shape[1]
         counts = self.segments[self.segments > 0] + order - 1 if is_spline else np.full(len(controls), order)
-        return CurveSet("linearcurve" if order == 2 else "bsplinecurve", controls[is_new], counts)
+        return CurveSet("linearcurve" if is_linear else "bsplinecurve", controls[is_new], counts)
 
     def has_corners(self, points: NDArray[np.float64]) -> bool:
         """Whether cubic segments meet at an angle, where their tubes have a gap."""
@@ -132,17 +122,23 @@ def read_curves(
     notes: StageWarnings,
 ) -> tuple[CageContents, CurveSet]:
     """Curves of a prim; and their points, with primvars along them. Raises ValueError if they are unusable."""
-    path, curves, primvars = prim.GetPath(), UsdGeom.BasisCurves(prim), UsdGeom.PrimvarsAPI(prim)
+    curves, primvars = UsdGeom.BasisCurves(prim), UsdGeom.PrimvarsAPI(prim)
+    kind, basis, wrap = (str(value_at(prim.GetAttribute(name), time)) for name in ("type", "basis", "wrap"))
     points = _numbers(value_at(curves.GetPointsAttr(), time))
-    topology = _topology(curves, time, len(points))
-
+    counts = np.array(value_at(curves.GetCurveVertexCountsAttr(), time) or [], dtype=np.int64)
+    topology = CurveTopology(counts, basis if kind == "cubic" else kind, wrap)
+    if topology.basis not in BASES or wrap not in ("nonperiodic", "periodic", "pinned"):
+        raise ValueError(f'curves are "{topology.basis}" and "{wrap}"; expected linear, bezier, bspline or catmullRom')
+    if counts.min(initial=0) < 0 or counts.sum() != len(points) or not topology.segments.any():
+        raise ValueError(f"curveVertexCounts are {counts.sum()}; expected as many as points, {len(points)}, for curves")
     primvar = primvars.GetPrimvar("widths")
-    owner = primvar if primvar.HasValue() else curves
-    widths = _flattened(primvar, time) if owner is primvar else _numbers(value_at(curves.GetWidthsAttr(), time), 1)
-    given = str(primvar.GetInterpolation() if owner is primvar else curves.GetWidthsInterpolation())
-    given = "constant" if len(widths) == 1 else given
-    if not topology.has(len(widths), given) or not (widths >= 0).all():
-        raise ValueError(f"there are {len(widths)} {given} widths; expected as many as {given} values, 0 or more")
+    if primvar.HasValue():
+        widths, of_widths = _flattened(primvar, time), str(primvar.GetInterpolation())
+    else:
+        widths, of_widths = _numbers(value_at(curves.GetWidthsAttr(), time), 1), str(curves.GetWidthsInterpolation())
+    of_widths = "constant" if len(widths) == 1 else of_widths
+    if not topology.has(len(widths), of_widths) or not (widths >= 0).all():
+        raise ValueError(f"there are {len(widths)} {of_widths} widths; expected one for each, 0 or more")
     sizes = np.linalg.svd(to_world[:3, :3], compute_uv=False)
     told = {
         "curves with too few points are left out": not topology.segments.all(),
@@ -152,36 +148,21 @@ def read_curves(
         "curves stay round where transforms stretch them": sizes[0] > _EVEN * sizes[2],
     }
     for what in (what for what, is_so in told.items() if is_so):
-        notes.add(what, path)
+        notes.add(what, prim.GetPath())
     attributes = {}
-    varying = (primvar for name in names if (primvar := primvars.GetPrimvar(name)).HasValue())
-    for primvar in (primvar for primvar in varying if primvar.GetInterpolation() != "constant"):
-        values, kind = _flattened(primvar, time), str(primvar.GetInterpolation())
-        if not topology.has(len(values), kind):
+    for primvar in filter(UsdGeom.Primvar.HasValue, map(primvars.GetPrimvar, names)):
+        values, given = _flattened(primvar, time), str(primvar.GetInterpolation())
+        if not topology.has(len(values), given):
             notes.add("primvars of curves that have another number of values are ignored", primvar.GetAttr().GetPath())
-            continue
-        powers = topology.powers(values, kind)
-        samples = (_PLACES[:, None] if kind != "uniform" else np.zeros((1, 1))) ** np.arange(powers.shape[1]) @ powers
-        attributes[str(primvar.GetPrimvarName())] = Attribute(samples.reshape(-1, values.shape[1]), "vertex")
+        elif given != "constant":
+            powers = topology.powers(values, given)
+            samples = (_PLACES[: 1 if given == "uniform" else None] ** np.arange(powers.shape[1])) @ powers
+            attributes[str(primvar.GetPrimvarName())] = Attribute(samples.reshape(-1, values.shape[1]), "vertex")
     # Mitsuba's curves have texture coordinates of their own.
-    texcoords = Attribute(np.zeros((len(points), 2)), "vertex")
-    source = CageSource(str(path))
-    cage = CageContents(points, _NO_FACES, _NO_FACES, texcoords=texcoords, attributes=attributes, source=source)
-    return cage, topology.curve_set(points, widths / 2, given)
-
-
-def _topology(curves: UsdGeom.BasisCurves, time: Usd.TimeCode, point_count: int) -> CurveTopology:
-    """Raises ValueError if the attributes are not those of curves."""
-    counts = np.array(value_at(curves.GetCurveVertexCountsAttr(), time) or [], dtype=np.int64)
-    named = (curves.GetTypeAttr(), curves.GetBasisAttr(), curves.GetWrapAttr())
-    kind, basis, wrap = (str(value_at(attribute, time)) for attribute in named)
-    basis = basis if kind == "cubic" else kind
-    if basis not in BASES or wrap not in _WRAPS:
-        raise ValueError(f'curves are "{basis}" and "{wrap}"; expected {", ".join(BASES)}, and {", ".join(_WRAPS)}')
-    topology = CurveTopology(counts, basis, wrap)
-    if counts.min(initial=0) < 0 or counts.sum() != point_count or not topology.segments.any():
-        raise ValueError(f"curveVertexCounts are {counts.sum()}; expected {point_count}, as many as points, for curves")
-    return topology
+    texcoords, no_faces = Attribute(np.zeros((len(points), 2)), "vertex"), np.zeros(0, np.int64)
+    named: dict[str, Any] = {"texcoords": texcoords, "source": CageSource(str(prim.GetPath()))}
+    cage = CageContents(points, no_faces, no_faces, attributes=attributes, **named)
+    return cage, topology.curve_set(points, widths / 2, of_widths)
 
 
 def _flattened(primvar: UsdGeom.Primvar, time: Usd.TimeCode) -> NDArray[np.float64]:

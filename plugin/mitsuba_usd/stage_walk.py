@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mitsuba_subdivision import files
@@ -21,11 +20,12 @@ from mitsuba_subdivision.messages import timed
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel
 
-from .contents import CameraContents, InstanceContents, MaterialContents, SceneContents
+from .contents import CameraContents, InstanceContents, MaterialContents, PictureContents, SceneContents
 from .materialx_layers import with_documents
-from .stage_lights_and_camera import read_camera, read_emission, read_light, read_settings
+from .stage_lights_and_camera import read_camera, read_emission, read_light
 from .stage_materials import MaterialReader
 from .stage_meshes import COLORS, GPRIMS, ShapeReader, are_invertible
+from .stage_settings import read_settings
 from .stage_warnings import StageWarnings
 
 # Draw modes by which a viewer shows a model as it is.
@@ -68,7 +68,7 @@ class StageReader:
                 walk = _StageWalk(self._stage, name, time, self._notes, at)
                 if self._before is not None and self._is_still:
                     camera, picture = walk.camera(self._camera)
-                    return replace(self._before, camera=camera, **picture)
+                    return replace(self._before, camera=camera, picture=picture)
                 self._before = walk.contents(self._camera)
                 return self._before
 
@@ -155,10 +155,10 @@ class _StageWalk:
                 _add_copy(whole, prototype, instance)
         groups = [self._prototypes[number].shapes for number in numbers]
         chosen, picture = self.camera(camera)
-        return SceneContents(up, whole.shapes, groups, instances, whole.lights, chosen, **picture)
+        return SceneContents(up, whole.shapes, groups, instances, whole.lights, chosen, picture)
 
-    def camera(self, wanted: str | None) -> tuple[CameraContents | None, dict[str, Any]]:
-        """The camera, None if there is none, and fields of `SceneContents` by the stage's render settings.
+    def camera(self, wanted: str | None) -> tuple[CameraContents | None, PictureContents]:
+        """The camera, None if there is none, and the stage's render settings.
 
         A camera is wanted by its path, or by its name if no other camera has it.
         """
@@ -245,6 +245,8 @@ class _StageWalk:
         elif prim.IsA(UsdGeom.PointInstancer):
             below.instances.extend(self._point_instances(UsdGeom.PointInstancer(prim), name, matrix()))
         elif prim.IsA(UsdGeom.Mesh) or str(prim.GetTypeName()) in GPRIMS:
+            if prim.HasAttribute("mitsuba:sensor"):
+                self._notes.add("mitsuba:sensor of shapes is ignored; pictures are those of cameras", prim.GetPath())
             below.shapes.extend(replace(shape, name=name) for shape in self._shapes.read(prim, matrix()))
         elif prim.HasAPI(UsdLux.LightAPI):
             files.require_types(prim, self._code)

@@ -262,7 +262,7 @@ def test_every_value_of_a_prim_is_its_default_or_else_its_first_sample(stage):
 
     plain, alone = contents("default"), cage("default", [])
     assert {shape.name for shape in plain.shapes} == {"/cube", "/sheet"}
-    assert (plain.camera.focal_length, plain.lights[0].size, plain.resolution) == (70, [2], [20, 10])
+    assert (plain.camera.focal_length, plain.lights[0].size, plain.picture.resolution) == (70, [2], [20, 10])
     assert [len(tags) for tags in (alone.creases, alone.corners, alone.holes)] == [1, 1, 1]
     for stored in ("samples", "both"):
         assert same(contents(stored), plain)
@@ -810,7 +810,7 @@ def test_the_aperture_fits_the_picture_as_render_settings_say(scene, projection,
     text = settings(RESOLUTION, f'uniform token aspectRatioConformPolicy = "{policy}"')
     text += camera(f'token projection = "{projection}"', aperture=3) + mesh("cube", CUBE)
     entries, messages = told(scene, text, NAMED)
-    is_told = ['aspectRatioConformPolicy "adjustPixelAspectRatio" is ignored' in message for message in messages]
+    is_told = ["aspectRatioConformPolicy of render settings is ignored; " in message for message in messages]
     assert is_told == [True] * ("Pixel" in policy)
     sensor = mi.load_dict(entries["sensor"])
     assert tuple(sensor.film().size()) == (40, 20)
@@ -825,15 +825,16 @@ def frame(setting="", of_camera=""):
     return settings("" if "resolution" in setting else RESOLUTION, setting) + camera(of_camera)
 
 
-OTHER_SETTINGS = ["float pixelAspectRatio = 2", "float4 dataWindowNDC = (0, 0, 0.5, 1)"]
+OTHER_SETTINGS = ["float pixelAspectRatio = 2", "float4 dataWindowNDC = (0.5, 0, 0.5, 1)"]
 OTHER_SETTINGS += ['token[] includedPurposes = ["default", "proxy"]', 'token[] materialBindingPurposes = ["preview"]']
 OTHER_SETTINGS += ['token renderingColorSpace = "acescg"']
 IGNORED_SETTINGS = [
     *((f"uniform {line}", f"{line.split()[1]} of render settings is ignored") for line in OTHER_SETTINGS),
-    ("rel products = </product>", "render products are ignored; the picture is that of the render settings"),
-    ('uniform token aspectRatioConformPolicy = "other"', 'aspectRatioConformPolicy "other" is ignored; expand'),
-    ("uniform int2 resolution = (0, 20)", "a resolution of render settings that is not two numbers above 0"),
-    ('uniform token resolution = "large"', "a resolution of render settings that is not two numbers above 0"),
+    ("rel products = </product>", "productType of render settings is ignored"),
+    ("uniform float4 dataWindowNDC = (0, 0, 1.5, 1)", "dataWindowNDC of render settings is cut to the picture"),
+    ('uniform token aspectRatioConformPolicy = "other"', "aspectRatioConformPolicy of render settings is ignored; exp"),
+    ("uniform int2 resolution = (0, 20)", "resolution of render settings is ignored; expected two numbers above 0"),
+    ('uniform token resolution = "large"', "resolution of render settings is ignored; expected two numbers above 0"),
 ]
 IGNORED_OF_CAMERAS = [
     ("float exposure = 1", "exposure of cameras is ignored; pictures have the radiance of the scene"),
@@ -891,7 +892,7 @@ IGNORED = [
 @pytest.mark.parametrize(("text", "message", "end"), IGNORED)
 def test_what_is_not_followed_is_told_once_by_name(scene, tmp_path, text, message, end):
     stages.flat(tmp_path / "black.png", [0, 0, 0])
-    text += prim("RenderProduct", "product") + mesh("square", SQUARE)
+    text += prim("RenderProduct", "product", 'uniform token productType = "deepRaster"') + mesh("square", SQUARE)
     entries, (warning,) = told(scene, text, NAMED if "settings" in text else "")
     assert message in warning
     assert warning.endswith(end)
@@ -902,7 +903,7 @@ def test_what_is_not_followed_is_told_once_by_name(scene, tmp_path, text, messag
 def test_render_settings_that_the_stage_does_not_name_are_told(stage, head):
     path = stage(settings(RESOLUTION) + CAMERA + mesh("cube", CUBE), head=head)
     with pytest.warns(CageWarning, match=r"render settings are those that .* all others are ignored \(/settings\)"):
-        assert StageReader(path).at().resolution is None
+        assert StageReader(path).at().picture.resolution is None
 
 
 def test_of_several_cameras_the_first_is_used_and_told(stage):
