@@ -187,6 +187,7 @@ class CameraContents:
 class PictureContents:
     """Render settings of a stage, with those of its first render product."""
 
+    name: str = ""  # Path of the prim
     resolution: list[int] | None = None
     window: list[float] | None = None  # Least x and y, then largest, of what is rendered of the picture: y points up
     is_transparent: bool = False  # Whether pictures have alpha

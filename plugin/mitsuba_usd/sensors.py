@@ -43,7 +43,7 @@ def _accepted(stated: SceneNode, own: SceneNode, what: str, prim: str, notes: St
     try:
         return stated if stated is own or mi.load_dict(stated) else own
     except RuntimeError as error:
-        notes.add(f"{what} is ignored: {' '.join(str(error).rpartition('] ')[2].split())}", prim)
+        notes.add(f"{what} is ignored: {' '.join(str(error).partition(': ')[2].split())}", prim)
         return own
 
 
@@ -156,7 +156,7 @@ def with_studio_defaults(
     if stated := contents.picture.integrator:
         own = scene["integrator"]
         stated = stated if stated.get("type", own["type"]) != own["type"] else {**own, **stated}
-        scene["integrator"] = _accepted(stated, own, "mitsuba:integrator", "render settings", notes)
+        scene["integrator"] = _accepted(stated, own, "mitsuba:integrator", contents.picture.name, notes)
     if camera is None:
         scene["sensor"] = cropped(entries["sensor"], contents.picture.window)
     else:

@@ -81,6 +81,7 @@ def read_settings(
     if value("disableDepthOfField"):
         changes |= {"lens_radius": 0.0, "focus_distance": 0.0}
     picture = PictureContents(
+        str(path),
         size and list(size),
         window and np.clip(window, 0, 1).tolist(),
         bool(value(_TRANSPARENT)),
