@@ -183,13 +183,17 @@ class CameraContents:
     mitsuba: dict[str, Any] = field(default_factory=dict)  # Parameters of Mitsuba's sensor that the prim states
 
 
+# Of a picture, whose y points up.
+WHOLE = [0.0, 0.0, 1.0, 1.0]
+
+
 @dataclass(frozen=True, eq=False)
 class PictureContents:
     """Render settings of a stage, with those of its first render product."""
 
     name: str = ""  # Path of the prim
     resolution: list[int] | None = None
-    window: list[float] | None = None  # Least x and y, then largest, of what is rendered of the picture: y points up
+    window: list[float] = field(default_factory=lambda: WHOLE)  # Least x and y, then largest, of what is rendered
     is_transparent: bool = False  # Whether pictures have alpha
     spp: int | None = None  # Samples per pixel
     integrator: dict[str, Any] = field(default_factory=dict)  # Parameters of Mitsuba's integrator

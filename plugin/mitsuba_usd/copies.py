@@ -163,9 +163,8 @@ def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> S
         source=CageSource(f"{cage.source.name}, {count} copies"),
     )
     shown = None if shape.shown_faces is None else (shape.shown_faces + face).ravel()
-    curves = shape.curves and shape.curves.placed(matrices)
-    changed = replace(shape, name=name, cage=copied, to_world=np.eye(4), normals=normals, curves=curves)
-    return replace(changed, shown_faces=shown)
+    shape = replace(shape, curves=shape.curves and shape.curves.placed(matrices))
+    return replace(shape, name=name, cage=copied, to_world=np.eye(4), normals=normals, shown_faces=shown)
 
 
 def _attribute(given: Attribute, corners: IntArray) -> Attribute:

@@ -11,7 +11,7 @@ from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
 from .bsdfs import integrator, rgb
-from .contents import CameraContents, PictureContents, SceneContents
+from .contents import WHOLE, CameraContents, PictureContents, SceneContents
 from .emitters import are_lamps_in_the_way
 from .stage_warnings import StageWarnings
 
@@ -26,13 +26,9 @@ _LEAST_SIZE = 1e-6
 
 
 def sensor(
-    camera: CameraContents,
-    size: tuple[int, int],  # (width, height) in pixels
-    picture: PictureContents,
-    spp: int | None,
-    notes: StageWarnings,
+    camera: CameraContents, size: tuple[int, int], picture: PictureContents, spp: int | None, notes: StageWarnings
 ) -> SceneNode:
-    """A sensor whose film is the camera's aperture, with the parameters of Mitsuba that the camera's prim has."""
+    """A sensor with a film (width, height) of the camera's aperture, and parameters of Mitsuba that the prim has."""
     own, stated = _sensor(camera, size, spp, notes), camera.mitsuba
     stated = {**own, **stated, "film": {**own["film"], **stated.get("film", {})}} if stated else own
     return cropped(_accepted(stated, own, "mitsuba:sensor", camera.name, notes), picture.window)
@@ -47,22 +43,17 @@ def _accepted(stated: SceneNode, own: SceneNode, what: str, prim: str, notes: St
         return own
 
 
-def cropped(sensor: SceneNode, window: list[float] | None) -> SceneNode:
+def cropped(sensor: SceneNode, window: list[float]) -> SceneNode:
     """A sensor that renders the pixels whose centres are in a window; see `PictureContents`."""
-    film = sensor["film"]
-    size = [film.get(f"crop_{name}", film[name]) for name in ("width", "height")]
-    left, below, right, above = window or (0, 0, 1, 1)
-    first, end = (
-        np.ceil(np.multiply(size, corner) - 0.5).astype(int) for corner in ((left, 1 - above), (right, 1 - below))
-    )
-    if window is None or [*first, *end] == [0, 0, *size]:
+    film, (left, below, right, above) = sensor["film"], window
+    if window == WHOLE:
         return sensor
-    crop = dict(zip(("crop_width", "crop_height"), np.maximum(end - first, 1).tolist(), strict=True))
-    crop |= {
-        f"crop_offset_{axis}": int(start) + film.get(f"crop_offset_{axis}", 0)
-        for axis, start in zip("xy", first, strict=True)
-    }
-    return {**sensor, "film": {**film, **crop}}
+    size = [film.get("crop_width", film["width"]), film.get("crop_height", film["height"])]
+    first, end = np.ceil(np.multiply(size, [[left, 1 - above], [right, 1 - below]]) - 0.5).astype(int)
+    offset = np.add(first, [film.get("crop_offset_x", 0), film.get("crop_offset_y", 0)])
+    numbers = [*np.maximum(end - first, 1).tolist(), *offset.tolist()]
+    names = ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
+    return {**sensor, "film": {**film, **dict(zip(names, numbers, strict=True))}}
 
 
 def _sensor(camera: CameraContents, size: tuple[int, int], spp: int | None, notes: StageWarnings) -> SceneNode:

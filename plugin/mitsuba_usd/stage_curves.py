@@ -41,20 +41,16 @@ class CurveTopology:
     wrap: str  # "nonperiodic", "periodic" or "pinned"
 
     @property
-    def _step(self) -> int:
-        return 3 if self.basis == "bezier" else 1
-
-    @property
-    def _added(self) -> int:
-        """Points beyond each end, with which pinned curves begin and end at their own points."""
-        return int(self.wrap == "pinned" and self.basis in ("bspline", "catmullRom"))
+    def _steps(self) -> tuple[int, int]:
+        """Points from segment to segment; points beyond each end, where pinned curves reach their own ends by them."""
+        return (3, 0) if self.basis == "bezier" else (1, int(self.wrap == "pinned" and self.basis != "linear"))
 
     @cached_property
     def segments(self) -> IntArray:
         """Number of segments of each curve, ``(n,)``: 0 where there are too few points."""
-        if self.wrap == "periodic":
-            return self.counts // self._step
-        return np.maximum((self.counts + 2 * self._added - len(BASES[self.basis])) // self._step + 1, 0)
+        step, added = self._steps
+        missing = 0 if self.wrap == "periodic" else len(BASES[self.basis]) - step - 2 * added
+        return np.maximum((self.counts - missing) // step, 0)
 
     @cached_property
     def _curve(self) -> IntArray:
@@ -74,7 +70,8 @@ class CurveTopology:
         """Coefficients ``(n_s, 2 or 4, k)`` of powers of the parameter, along each segment, of values ``(m, k)``."""
         basis, number = BASES[self.basis], ragged.index_in_row(self.segments)[:, None]
         if interpolation == "vertex":
-            return np.asarray(basis @ self._controls(values, self._step * number + np.arange(len(basis)) - self._added))
+            step, added = self._steps
+            return np.asarray(basis @ self._controls(values, step * number + np.arange(len(basis)) - added))
         row = np.repeat(self._curve[:, None], 2, axis=1) * (interpolation == "uniform")
         if interpolation == "varying":
             row = ragged.starts(self._ends)[self._curve, None] + (number + np.arange(2)) % self._ends[self._curve, None]
@@ -115,13 +112,9 @@ class CurveTopology:
 
 
 def read_curves(
-    prim: Usd.Prim,
-    to_world: NDArray[np.float64],  # (4, 4)
-    time: Usd.TimeCode,
-    names: Iterable[str],  # Of primvars
-    notes: StageWarnings,
+    prim: Usd.Prim, to_world: NDArray[np.float64], time: Usd.TimeCode, names: Iterable[str], notes: StageWarnings
 ) -> tuple[CageContents, CurveSet]:
-    """Curves of a prim; and their points, with primvars along them. Raises ValueError if they are unusable."""
+    """Curves; and their points, with primvars of these names along them. Raises ValueError if they are unusable."""
     curves, primvars = UsdGeom.BasisCurves(prim), UsdGeom.PrimvarsAPI(prim)
     kind, basis, wrap = (str(value_at(prim.GetAttribute(name), time)) for name in ("type", "basis", "wrap"))
     points = _numbers(value_at(curves.GetPointsAttr(), time))
@@ -132,10 +125,9 @@ def read_curves(
     if counts.min(initial=0) < 0 or counts.sum() != len(points) or not topology.segments.any():
         raise ValueError(f"curveVertexCounts are {counts.sum()}; expected as many as points, {len(points)}, for curves")
     primvar = primvars.GetPrimvar("widths")
-    if primvar.HasValue():
-        widths, of_widths = _flattened(primvar, time), str(primvar.GetInterpolation())
-    else:
-        widths, of_widths = _numbers(value_at(curves.GetWidthsAttr(), time), 1), str(curves.GetWidthsInterpolation())
+    has_widths = primvar.HasValue()
+    widths = _flattened(primvar, time) if has_widths else _numbers(value_at(curves.GetWidthsAttr(), time), 1)
+    of_widths = str(primvar.GetInterpolation() if has_widths else curves.GetWidthsInterpolation())
     of_widths = "constant" if len(widths) == 1 else of_widths
     if not topology.has(len(widths), of_widths) or not (widths >= 0).all():
         raise ValueError(f"there are {len(widths)} {of_widths} widths; expected one for each, 0 or more")

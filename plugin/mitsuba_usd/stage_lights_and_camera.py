@@ -137,47 +137,47 @@ def read_camera(
     notes: StageWarnings,
 ) -> CameraContents:
     """Read a camera. Raises TypeError, ValueError if it has no image."""
+    prim, path = camera.GetPrim(), camera.GetPath()
     x, y, z = to_world[:3, :3].T
     forward = -z / np.linalg.norm(z)
     up = y - forward * (forward @ y)
     up /= np.linalg.norm(up)
     right = np.cross(forward, up)
     if right @ x < 0:
-        notes.add("reflections in the transforms of cameras are ignored", camera.GetPath())
+        notes.add("reflections in the transforms of cameras are ignored", path)
     rigid = np.eye(4)
     rigid[:3, :3], rigid[:3, 3] = np.stack([right, up, -forward], axis=1), to_world[:3, 3]
 
-    def number(attribute: Usd.Attribute) -> float:
-        return float(value_at(attribute, time))
+    def number(name: str) -> float:
+        return float(value_at(prim.GetAttribute(name), time))
 
     projection = str(value_at(camera.GetProjectionAttr(), time))
     if projection not in ("perspective", "orthographic"):
-        notes.add(f'the projection "{projection}" of cameras is ignored, and perspective is used', camera.GetPath())
+        notes.add(f'the projection "{projection}" of cameras is ignored, and perspective is used', path)
     is_perspective = projection != "orthographic"
     unit = 1.0 if is_perspective else _TENTHS
-    aperture = [number(camera.GetHorizontalApertureAttr()), number(camera.GetVerticalApertureAttr())]
-    offset = [number(camera.GetHorizontalApertureOffsetAttr()), number(camera.GetVerticalApertureOffsetAttr())]
-    shutter = [number(camera.GetShutterOpenAttr()), number(camera.GetShutterCloseAttr())]
+    sides = ("horizontalAperture", "verticalAperture")
+    film = [unit * number(side) for side in sides], [unit * number(f"{side}Offset") for side in sides]
+    shutter = [number("shutter:open"), number("shutter:close")]
     near, far = value_at(camera.GetClippingRangeAttr(), time)
     if not near <= far:
-        notes.add("a clippingRange of cameras that is not from a number to a larger one is ignored", camera.GetPath())
+        notes.add("a clippingRange of cameras that is not from a number to a larger one is ignored", path)
         near, far = _CLIPPING_RANGE
-    focal_length, f_stop = number(camera.GetFocalLengthAttr()), number(camera.GetFStopAttr())
-    focus = number(camera.GetFocusDistanceAttr())
+    focal_length, f_stop, focus = number("focalLength"), number("fStop"), number("focusDistance")
     has_lens = is_perspective and f_stop > 0 and focus > 0
     if is_perspective and f_stop > 0 >= focus:
-        notes.add("fStop of cameras without a focusDistance above 0 is ignored", camera.GetPath())
+        notes.add("fStop of cameras without a focusDistance above 0 is ignored", path)
     for name, neutral in _NEUTRAL_EXPOSURE.items():
-        attribute = camera.GetPrim().GetAttribute(name)
-        if attribute and value_at(attribute, time) != neutral:
-            notes.add(f"{name} of cameras is ignored; pictures have the radiance of the scene", camera.GetPath())
+        if value_at(prim.GetAttribute(name), time) not in (None, neutral):
+            notes.add(f"{name} of cameras is ignored; pictures have the radiance of the scene", path)
     if value_at(camera.GetClippingPlanesAttr(), time):
-        notes.add("clippingPlanes of cameras are ignored", camera.GetPath())
-    known = [*to_world.ravel(), *aperture, *offset, focal_length, near, far, focus if has_lens else 0, *shutter]
-    if not np.isfinite(known).all() or min(*aperture, focal_length) <= 0:
-        raise ValueError("the camera has no image")
-    film = [unit * length for length in aperture], [unit * length for length in offset]
+        notes.add("clippingPlanes of cameras are ignored", path)
     lens = (_TENTHS * focal_length / (2 * f_stop), focus) if has_lens else (0.0, 0.0)
     numbers = focal_length, float(near), float(far), *lens
-    stated = namespaced(camera.GetPrim(), "mitsuba:sensor", time)
-    return CameraContents(str(camera.GetPath()), rigid, is_perspective, *film, *numbers, shutter, mitsuba=stated)
+    if (
+        not np.isfinite([*to_world.ravel(), *film[0], *film[1], *numbers, *shutter]).all()
+        or min(*film[0], numbers[0]) <= 0
+    ):
+        raise ValueError("the camera has no image")
+    stated = namespaced(prim, "mitsuba:sensor", time)
+    return CameraContents(str(path), rigid, is_perspective, *film, *numbers, shutter, mitsuba=stated)

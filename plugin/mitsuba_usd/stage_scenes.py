@@ -65,8 +65,7 @@ class StageScenes:
     ) -> None:
         self.name = f'"{path}"'
         self._shutter, self._interval, self._over = shutter, interval, over
-        self._look = look if look.spp is None else replace(look, spp=self._of_sub_frame(look.spp))
-        self._path, self._parameters = path, parameters
+        self._path, self._look, self._spp, self._parameters = path, look, look.spp, parameters
         self._time, self._camera = time, camera
         self._has_free_rates = not is_chosen(parameters)
         self._files = None if numbers is None else studio.FrameFiles(Path(path), numbers)
@@ -82,9 +81,6 @@ class StageScenes:
         self._is_lit = False
         # Of the textures of all frames.
         self._needed: dict[str, float] | None = None
-
-    def _of_sub_frame(self, spp: int) -> int:
-        return -(-spp // (self._shutter or 1))
 
     def at(self, number: int | None = None) -> SceneContents:
         """Visible contents of a frame; by default, at the given time, where it is an error if nothing is visible."""
@@ -119,10 +115,10 @@ class StageScenes:
             self._parameters = {**self._parameters, "shading": shading}
         self._is_lit |= contents.is_lit
         look, picture = self._look, contents.picture
-        spp = self._of_sub_frame(picture.spp or studio.DEFAULT_SPP) if look.spp is None else look.spp
+        spp = (picture.spp or studio.DEFAULT_SPP) if self._spp is None else self._spp
         self.aovs, self.products = {**picture.aovs, **look.aovs}, picture.products
         is_transparent = look.transparent or picture.is_transparent
-        self._look = replace(look, spp=spp, transparent=is_transparent, aovs=self.aovs)
+        self._look = replace(look, spp=-(-spp // (self._shutter or 1)), transparent=is_transparent, aovs=self.aovs)
         return contents
 
     def _enlarged(self, given: SceneContents) -> SceneContents:

@@ -12,7 +12,7 @@ from mitsuba_subdivision.files import value_at
 from mitsuba_subdivision.studio import AOVS
 from pxr import Gf, Sdf, Tf, Usd, UsdRender
 
-from .contents import PictureContents
+from .contents import WHOLE, PictureContents
 from .stage_warnings import StageWarnings
 
 # Values of attributes that are ignored, with which they have no effect.
@@ -72,7 +72,11 @@ def read_settings(
     size = fitting("resolution", lambda given: isinstance(given, Gf.Vec2i) and min(given) > 0, "two numbers above 0")
     spp = fitting("mitsuba:sample_count", lambda given: isinstance(given, int) and given > 0, "a number above 0")
     policy = fitting("aspectRatioConformPolicy", _CONFORM_POLICIES.__contains__, ", ".join(_CONFORM_POLICIES))
-    window = fitting("dataWindowNDC", _is_window, "(xmin, ymin, xmax, ymax) in the picture")
+    window = fitting(
+        "dataWindowNDC",
+        lambda given: isinstance(given, Gf.Vec4f) and all(max(given[i], 0) < min(given[i + 2], 1) for i in (0, 1)),
+        "(xmin, ymin, xmax, ymax) in the picture",
+    )
     if window and (np.clip(window, 0, 1) != window).any():
         notes.add("dataWindowNDC of render settings is cut to the picture", path)
     changes: dict[str, Any] = {"conform_policy": policy or _CONFORM_POLICIES[0]}
@@ -83,7 +87,7 @@ def read_settings(
     picture = PictureContents(
         str(path),
         size and list(size),
-        window and np.clip(window, 0, 1).tolist(),
+        np.clip(window or WHOLE, 0, 1).tolist(),
         bool(value(_TRANSPARENT)),
         spp,
         namespaced(prim, "mitsuba:integrator", time),
@@ -92,10 +96,6 @@ def read_settings(
         name = Path(str(value_at(product.GetProductNameAttr(), time))).stem or product.GetPrim().GetName()
         picture.products[name] = _variables(product, picture.aovs, time, notes)
     return picture, str(cameras[0][0]) if cameras else None, changes
-
-
-def _is_window(given: Any) -> bool:
-    return isinstance(given, Gf.Vec4f) and all(max(given[i], 0) < min(given[i + 2], 1) for i in (0, 1))
 
 
 def _variables(product: UsdRender.Product, aovs: dict[str, str], time: Usd.TimeCode, notes: StageWarnings) -> list[str]:
@@ -117,7 +117,8 @@ def _variables(product: UsdRender.Product, aovs: dict[str, str], time: Usd.TimeC
 def namespaced(prim: Usd.Prim, namespace: str, time: Usd.TimeCode) -> dict[str, Any]:
     """Attributes of a prim in a namespace as nested dictionaries: ``film:filter:type`` is the type within two."""
     found: dict[str, Any] = {}
-    for attribute in prim.GetAuthoredPropertiesInNamespace(namespace):
+    inside = (given for given in prim.GetAuthoredAttributes() if given.GetName().startswith(f"{namespace}:"))
+    for attribute in inside:
         *groups, name = attribute.GetName().removeprefix(f"{namespace}:").split(":")
         within = found
         for group in groups:
@@ -129,7 +130,7 @@ def namespaced(prim: Usd.Prim, namespace: str, time: Usd.TimeCode) -> dict[str, 
 
 def read_variant(path: str | Path, over: str | Path | None) -> str | None:
     """Variant of Mitsuba that a stage's render settings ask for; nothing else of the stage is read."""
-    with suppress(Tf.ErrorException):
+    with suppress(Tf.ErrorException, RuntimeError):
         layers = [layer for file in (over, path) if file and (layer := Sdf.Layer.FindOrOpen(str(file)))]
         root = Sdf.Layer.CreateAnonymous(".usda")
         root.subLayerPaths = [layer.identifier for layer in layers]

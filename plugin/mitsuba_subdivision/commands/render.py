@@ -29,21 +29,12 @@ from ..regression.image import METADATA_ATTRIBUTE
 from ..regression.scene import BOX, LoadedScene, kept_search_folders, load_scene, render_image
 from ..regression.tiers import Tolerances
 from ..shapes.parameter_table import SHADINGS
+from ..studio import AOVS, DEFAULT_VIEW, Look, sampler, variant_in_use
 from ..studio.animation import FrameRange, StillPicture, Turntable
 from ..studio.cage_scenes import CageScenes
 from ..studio.picture import denoised, require_denoiser, shading_for, weigh_lights
 from ..studio.saving import save_scene
-from ..studio.studio_entries import (
-    AOVS,
-    DEFAULT_VIEW,
-    LENGTHS,
-    UP_AXES,
-    VIEWS,
-    Environment,
-    Look,
-    sampler,
-    variant_in_use,
-)
+from ..studio.studio_entries import LENGTHS, UP_AXES, VIEWS, Environment
 from ..variants import set_variant, threads_set, variant_problem
 from ..whole_file import require_writable, whole_file
 from .arguments import CommandParser, above_zero, add_cage_options, add_variant, checked, finite, index, positive, seed
@@ -414,12 +405,9 @@ def _bitmap(image: NDArray[np.float32], channels: list[str], *, in_8_bits: bool)
 
 
 def _render_picture(
-    options: argparse.Namespace,
-    scenes: Iterable[LoadedScene],
-    spp: int | None = None,
-    source: Any = None,  # Of a model
+    options: argparse.Namespace, scenes: Iterable[LoadedScene], spp: int | None = None, source: Any = None
 ) -> Picture:
-    """Render a scene, or the mean of the scenes of a frame's sub-frames, which share no samples."""
+    """Render a scene of a source, or the mean of the scenes of a frame's sub-frames, which share no samples."""
     count = _sub_frames(options)
     total: Any = 0.0
     for part, loaded in enumerate(scenes):
