@@ -1,8 +1,4 @@
-"""Copies in place of many instances.
-
-Mitsuba's JIT variants trace and compile a separate program for each instance, at a cost that grows with the
-square of their number; see the page of files. One mesh of all copies of a shape has none of that.
-"""
+"""Copies in place of many instances, for which JIT variants compile programs in the square of their number of time."""
 
 from __future__ import annotations
 
@@ -23,8 +19,7 @@ from .stage_warnings import StageWarnings
 
 # Fewer instances cost less than a second in each picture.
 LEAST_INSTANCES = 64
-# From so many faces on, copies load sooner as shapes of their own, which share tables, than as one mesh, and in a third
-# of the memory. Each takes 3 ms of a picture.
+# Faces from which on copies load sooner as shapes of their own than as one mesh, in a third of the memory.
 LARGE = 10_000
 # Of copies as one mesh, measured; and what they may take of the memory of the machine, and at most.
 FACE_BYTES, TRIANGLE_BYTES, POINT_BYTES = {"exact": 600, "vertex": 300}, 170, 400
@@ -58,18 +53,15 @@ def with_large_copies(contents: SceneContents) -> SceneContents:
 
 def with_copies(
     contents: SceneContents,
-    # dict of (n,) int array by shape: segments on each edge of limit surfaces that their copies need, in the
-    # order of `contents.placed_shapes`
-    rates: Mapping[ShapeContents, IntArray],
+    rates: Mapping[ShapeContents, IntArray],  # (n,) int: segments that copies need, as `placed_shapes` has them
     shading: str,
     notes: StageWarnings,
     *,
     lowest: int = 1,
 ) -> tuple[SceneContents, dict[ShapeContents, int]]:
-    """A scene where copies of a shape are one shape, if there are many; and the rates of such shapes.
+    """A scene where many copies of a shape are one shape for each rate that they need; and the rates of such shapes.
 
-    Copies that need different rates are different shapes. If all would take more than `MOST_BYTES`, their highest rate
-    gives way, down to the lowest; if that is not enough, instances stay.
+    If all would take more than `MOST_BYTES`, the highest rate gives way, down to the lowest; or else instances stay.
     """
     are_many = len(contents.instances) >= LEAST_INSTANCES
     of_group: dict[int, list[NDArray[np.float64]]] = {}

@@ -1,8 +1,4 @@
-"""Shapes, materials, instances and lights of a stage as entries of a scene.
-
-Limit surfaces become the shape ``subdivision``, polygons meshes: entries, or objects that are kept from frame to frame.
-Cages that are equal share one limit surface.
-"""
+"""Shapes, materials, instances and lights of a stage as entries of a scene, or as objects kept from frame to frame."""
 
 from __future__ import annotations
 
@@ -44,8 +40,7 @@ from .sensors import RESERVED
 from .stage_warnings import StageWarnings
 from .textures import Textures
 
-# From so many faces on, control points stand for the surface, which lies among them and near them: a sphere with 64
-# faces around is smaller than its cage by a six-hundredth of its radius.
+# Faces from which on control points stand for the surface: a sphere with 64 around is smaller by a six-hundredth.
 DENSE = 2_000
 _NO_POINTS: NDArray[np.float64] = np.zeros((0, 3))
 # Fields of a shape that may differ between frames that share an object.
@@ -186,11 +181,7 @@ class Surfaces:
         return alike[-1]
 
     def points(self, contents: SceneContents) -> NDArray[np.float64]:
-        """Points ``(n, 3)`` in the world, all over limit surfaces or around them, and corners of polygons.
-
-        Of groups, there are the corners of their boxes. Where only control points differ from those of an earlier
-        call, weights are made once.
-        """
+        """Points ``(n, 3)`` in the world: on limit surfaces or around them, of other shapes, and boxes of groups."""
         of_shapes = [self._points_of(shape) for shape in counted(contents.shapes, "Limit surfaces")]
         boxes = []
         for group in contents.groups:
@@ -230,8 +221,7 @@ def subdivision(
     surface = surfaces.of(shape.cage)
     for message in surface.warnings:
         notes.add_message(message.replace(surface.contents.source.name, shape.cage.source.name), shape.name)
-    # Any, as the stubs call it an object.
-    tensor: Any = mi.TensorXu
+    tensor: Any = mi.TensorXu  # The stubs call it an object
     shown = shape.shown_faces
     return {
         "type": "subdivision",
@@ -280,11 +270,7 @@ def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
 
 
 class LoadedShapes:
-    """Objects of shapes in successive frames.
-
-    A limit surface that only moves reuses the object of the frame before, with new control points: its patches and
-    weights stay. A polygon mesh that moves is rebuilt.
-    """
+    """Objects of shapes in successive frames. Limit surfaces that only move keep theirs; other shapes are rebuilt."""
 
     def __init__(self) -> None:
         self._before: dict[tuple[str, int], tuple[ShapeContents, mi.Object]] = {}

@@ -21,7 +21,7 @@ NO_BLUR = "shutters of cameras have no effect without the option --shutter of re
 # Of pictures by a stage's camera.
 WIDTH = 640
 RESERVED = ("integrator", "sensor", *STUDIO, ENVIRONMENT)
-# Half the least size of what the studio is set up around, as a part of its place: a single point has no size.
+# Minimum half-extent of the framed content, relative to its position.
 _LEAST_SIZE = 1e-6
 
 
@@ -148,10 +148,8 @@ def with_studio_defaults(
         own = scene["integrator"]
         stated = stated if stated.get("type", own["type"]) != own["type"] else {**own, **stated}
         scene["integrator"] = _accepted(stated, own, "mitsuba:integrator", contents.picture.name, notes)
-    if camera is None:
-        scene["sensor"] = cropped(entries["sensor"], contents.picture.window)
-    else:
-        scene["sensor"] = sensor(camera, size, contents.picture, look.spp, notes)
+    seen = cropped(entries["sensor"], contents.picture.window)
+    scene["sensor"] = seen if camera is None else sensor(camera, size, contents.picture, look.spp, notes)
     if is_lit:
         return scene
     for name in (name for name in STUDIO if name in entries):

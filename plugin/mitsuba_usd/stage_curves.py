@@ -17,7 +17,6 @@ from pxr import Usd, UsdGeom, UsdSkel
 
 from .stage_warnings import StageWarnings
 
-CURVES = "BasisCurves"
 # Coefficients of the powers of a segment's parameter, by its control points.
 BASES: dict[str, NDArray[np.float64]] = {
     "linear": np.array([[1.0, 0], [-1, 1]]),
@@ -25,8 +24,7 @@ BASES: dict[str, NDArray[np.float64]] = {
     "bspline": np.array([[1.0, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6,
     "catmullRom": np.array([[0.0, 2, 0, 0], [-1, 0, 1, 0], [2, -5, 4, -1], [-1, 3, -3, 1]]) / 2,
 }
-# Sine of the largest angle between segments whose tubes meet without a visible gap, and the largest ratio of lengths
-# of a transform without distortion.
+# Sine of the largest angle without a gap between tubes, and largest ratio of lengths of even transforms.
 _STRAIGHT, _EVEN = 1e-3, 1.001
 # Parameters along each segment at which colours are sampled.
 _PLACES = (np.arange(8)[:, None] + 0.5) / 8

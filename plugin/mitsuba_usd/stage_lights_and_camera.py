@@ -37,8 +37,6 @@ _NEUTRAL_OF_LIGHTS = {
 }
 _NEUTRAL_EXPOSURE = {"exposure": 0.0, "exposure:iso": 100.0}
 _NEUTRAL_EXPOSURE |= dict.fromkeys(("exposure:time", "exposure:fStop", "exposure:responsivity"), 1.0)
-# The schema's fallback of clippingRange.
-_CLIPPING_RANGE = (1.0, 1e6)
 # Apertures and focal lengths are in tenths of the world's unit.
 _TENTHS = 0.1
 
@@ -162,7 +160,7 @@ def read_camera(
     near, far = value_at(camera.GetClippingRangeAttr(), time)
     if not near <= far:
         notes.add("a clippingRange of cameras that is not from a number to a larger one is ignored", path)
-        near, far = _CLIPPING_RANGE
+        near, far = 1.0, 1e6  # As the schema has them
     focal_length, f_stop, focus = number("focalLength"), number("fStop"), number("focusDistance")
     has_lens = is_perspective and f_stop > 0 and focus > 0
     if is_perspective and f_stop > 0 >= focus:

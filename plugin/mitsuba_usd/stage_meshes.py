@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pxr import Usd, UsdGeom, UsdLux, UsdShade
 
 from .contents import MaterialContents, ShapeContents
-from .stage_curves import CURVES, read_curves
+from .stage_curves import read_curves
 from .stage_lights_and_camera import read_emission
 from .stage_materials import MaterialReader
 from .stage_warnings import StageWarnings
@@ -50,7 +50,7 @@ class ShapeReader:
                 return self._parts(prim, to_world, location)
             require_types(prim, self._time)
             material = self._materials.bound(prim)
-            if str(prim.GetTypeName()) == CURVES:
+            if str(prim.GetTypeName()) == "BasisCurves":
                 names = COLORS if material is None else tuple(sorted(material.primvars()))
                 if material is not None and material.texcoords():
                     what = "textures of curves are looked up around them, and along all curves of a prim"
@@ -261,4 +261,4 @@ _OUTLINES: dict[str, Callable[[float, float], list[Line]]] = {
     "Cone": lambda r, h: _lines((0, -h), (r, -h), (0, h)),
     "Capsule": lambda r, h: [_arc(r, -90, 0, -h), *_lines((r, -h), (r, h)), _arc(r, 0, 90, h)],
 }
-GPRIMS = ("Cube", "Plane", *_OUTLINES, CURVES)
+GPRIMS = ("Cube", "Plane", *_OUTLINES, "BasisCurves")

@@ -56,9 +56,7 @@ class StageScenes:
         time: float | None = None,
         camera: str | None = None,  # Path of the stage's camera
         numbers: range | None = None,  # Times or numbers of files, if there are frames
-        # Number of the sub-frames of each frame, which share its samples. Their times are the middles of
-        # equal parts of the interval in which the shutter of the first frame's camera is open.
-        shutter: int | None = None,
+        shutter: int | None = None,  # Sub-frames of each frame, which share its samples; see `_delays`
         # When the shutter opens and closes, in time codes after the time; by default, as its camera says
         interval: tuple[float, float] | None = None,
         over: str | Path | None = None,  # A layer that is stronger than each file
@@ -133,7 +131,7 @@ class StageScenes:
         return replace(self._before[1], camera=camera, picture=given.picture)
 
     def _delays(self, first: SceneContents) -> list[float]:
-        """Times of sub-frames after the time of a frame."""
+        """Times of sub-frames after that of a frame: middles of equal parts of the first camera's open shutter."""
         if self._shutter is None:
             return [0.0]
         opens, closes = self._interval or (first.camera.shutter if first.camera else (0.0, 0.0))
@@ -272,8 +270,7 @@ class StageScenes:
         """The camera of a frame."""
         if contents.camera is None:
             return dict(rest["sensor"])
-        size, picture = size_for(first, self._look), contents.picture
-        return sensor(contents.camera, size, picture, self._look.spp, self._notes)
+        return sensor(contents.camera, size_for(first, self._look), contents.picture, self._look.spp, self._notes)
 
     def _texels_for_frames(self, first: SceneContents, rest: SceneNode) -> dict[str, float]:
         """Pixels along the sides of textures that any frame shows; of all frames, so that textures do not change."""

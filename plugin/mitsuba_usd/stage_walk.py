@@ -1,8 +1,4 @@
-"""A whole USD stage as plain data: its meshes, instances, lights and its camera.
-
-Invisible prims, guides and proxies are skipped. Instances of a prototype that look the same become one group of shapes;
-where that cannot be, they are copies.
-"""
+"""The visible prims of a whole USD stage as plain data. Instances that look the same are one group, or else copies."""
 
 from __future__ import annotations
 
@@ -55,10 +51,7 @@ class StageReader:
         self._before: SceneContents | None = None
 
     def at(self, time: float | None = None) -> SceneContents:
-        """Contents of the stage at a time code. Warns about everything that is ignored, once for each kind.
-
-        Without a time code, each value is the one that does not depend on time, or else its first sample.
-        """
+        """Contents at a time code; by default, of values without time, or first samples. Warns of what is ignored."""
         name = f'"{self._path}"'
         if time is not None and not math.isfinite(time):
             raise ValueError(f"{name}: time {time}; expected a finite number, a time code")
@@ -158,10 +151,7 @@ class _StageWalk:
         return SceneContents(up, whole.shapes, groups, instances, whole.lights, chosen, picture)
 
     def camera(self, wanted: str | None) -> tuple[CameraContents | None, PictureContents]:
-        """The camera, None if there is none, and the stage's render settings.
-
-        A camera is wanted by its path, or by its name if no other camera has it.
-        """
+        """The camera of a path, or of a name that no other has; None if there is none; and the render settings."""
         picture, named, changes = read_settings(self._stage, self._code, self._notes)
         path = wanted or named
         prims = self._stage.Traverse(Usd.TraverseInstanceProxies())
@@ -379,10 +369,7 @@ def _add_copy(contents: SceneContents, prototype: SceneContents, instance: Insta
 
 
 def _can_be_instanced(prototype: SceneContents) -> bool:
-    """Whether Mitsuba has instances of a prototype.
-
-    Instances cannot be emitters, and where they are hit, attributes of meshes are looked up in the wrong place.
-    """
+    """Whether Mitsuba has instances of a prototype: no emitters, nor attributes, which it looks up in another place."""
     is_hindered = (
         shape.radiance is not None
         or bool(shape.cage.attributes)
