@@ -91,7 +91,7 @@ class CurveTopology:
         """The curves, with points ``(m, 3)`` and radii ``(k, 1)``."""
         powers = np.concatenate([self.powers(points, "vertex"), self.powers(radii, interpolation)], axis=2)
         is_linear = self.basis == "linear"
-        controls = np.linalg.solve(BASES["linear" if is_linear else "bspline"], powers)
+        controls = np.linalg.inv(BASES["linear" if is_linear else "bspline"]) @ powers
         # Segments of a spline share points: each adds its last one to those before.
         is_spline = is_linear or (self.basis == "bspline" and interpolation != "varying")
         is_new = np.full(controls.shape[:2], not is_spline)

@@ -114,7 +114,7 @@ class StageScenes:
         self._is_lit |= contents.is_lit
         look, picture = self._look, contents.picture
         spp = (picture.spp or studio.DEFAULT_SPP) if self._spp is None else self._spp
-        self.aovs, self.products = {**picture.aovs, **look.aovs}, picture.products
+        self.aovs, self.products = {} if look.aovs is None else {**picture.aovs, **look.aovs}, picture.products
         is_transparent = look.transparent or picture.is_transparent
         self._look = replace(look, spp=-(-spp // (self._shutter or 1)), transparent=is_transparent, aovs=self.aovs)
         return contents

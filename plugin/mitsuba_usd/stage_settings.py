@@ -93,7 +93,8 @@ def read_settings(
         namespaced(prim, "mitsuba:integrator", time),
     )
     for product in products:
-        name = Path(str(value_at(product.GetProductNameAttr(), time))).stem or product.GetPrim().GetName()
+        stem, own = Path(str(value_at(product.GetProductNameAttr(), time))).stem, product.GetPrim().GetName()
+        name = own if stem in ("", *picture.products) else stem
         picture.products[name] = _variables(product, picture.aovs, time, notes)
     return picture, str(cameras[0][0]) if cameras else None, changes
 

@@ -134,6 +134,5 @@ def test_colours_along_curves(tmp_path, interpolation, values, expected, binding
 def test_what_curves_of_mitsuba_lack_is_told(tmp_path, change, message):
     text = hair(along("constant", [0.4]), bound()) + material("color3f inputs:diffuseColor = (1, 0, 0)") + camera()
     text += prim("Sphere", "ball")
-    for changed, messages in ((text, []), (text.replace(*change), [message])):
-        _, warnings = told(msub.usd_scene, write(tmp_path, changed, f"{len(messages)}.usda"), mi)
-        assert [part in warning for part, warning in zip(messages, warnings, strict=True)] == [True] * len(messages)
+    _, (warning,) = told(msub.usd_scene, write(tmp_path, text.replace(*change)), mi)
+    assert message in warning

@@ -937,7 +937,7 @@ def test_products_are_files_with_named_channels_of_mitsubas_integrator(stage, tm
     common = [RESOLUTION, "int mitsuba:sample_count = 4", 'string mitsuba:variant = "scalar_rgb"']
     path = stage(settings(*common, "rel products = [</first>, </second>]") + text, head=NAMED)
     assert main(["render", str(path), "-o", "a.exr", "--filter", "box"]) == 0
-    entries = msub.usd_scene(stage(settings(*common) + text, head=NAMED), mi)
+    entries = msub.usd_scene(path, mi)
     aovs = ",".join(f"{name}:{kind}" for name, (_, kind) in AOVS.items())
     entries["integrator"] = {"type": "aov", "aovs": aovs, "image": entries["integrator"]}
     entries["sensor"]["film"]["rfilter"] = {"type": "box"}

@@ -550,7 +550,7 @@ def _source(options: argparse.Namespace) -> Any:
         view=(azimuth, elevation),
         has_studio=not options.no_studio,
         scales=True,
-        **{name: value for name in _OF_LOOK if (value := getattr(options, name)) is not None},
+        **{"aovs": {}, **{name: value for name in _OF_LOOK if (value := getattr(options, name)) is not None}},
     )
     which = {"time": options.time, "numbers": options.frames}
     if _is_stage(options):

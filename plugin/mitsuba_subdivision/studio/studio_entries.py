@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import numbers
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -99,7 +99,8 @@ class Look:
     has_studio: bool = True  # Whether lights and backdrop of the studio are added where they are missing
     scales: bool = False  # Whether a scene is made larger by `enlargement`
     environment: Environment | None = None  # In place of all lights and the backdrop
-    aovs: Mapping[str, str] = field(default_factory=dict)  # Types of Mitsuba's AOVs, by the names of their channels
+    # Types of Mitsuba's AOVs by the names of their channels, besides those of a stage; None for no channels at all
+    aovs: Mapping[str, str] | None = None
 
 
 def enlargement(size: float) -> float:
@@ -195,7 +196,7 @@ def finished(scene: SceneNode, look: Look, up: str) -> SceneNode:
         picture = {"filename": name, "scale": look.environment.strength, "to_world": to_world}
         scene[ENVIRONMENT] = {"type": "envmap", **picture}
     scene = _without_background(scene) if look.transparent else scene
-    aovs = ",".join(f"{name}:{kind}" for name, kind in look.aovs.items())
+    aovs = ",".join(f"{name}:{kind}" for name, kind in (look.aovs or {}).items())
     return {**scene, "integrator": {"type": "aov", "aovs": aovs, "image": scene["integrator"]}} if aovs else scene
 
 
