@@ -1,20 +1,23 @@
-"""Triangles in memory: as a mesh of Mitsuba, as an entry of a scene that can be loaded, and as a PLY file."""
+"""Triangles and curves in memory: as a shape of Mitsuba, as an entry of a scene that can be loaded, and as a file."""
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from .cage.contents import Attribute
 from .device_arrays import upload
 from .files.ply import write_polygons
 from .mesh.connectivity import IntArray
 from .variants import SceneNode
+from .whole_file import write_text
 
 # Buffers that a mesh has without adding them as attributes, and their columns in a PLY file.
 _BUFFERS = {"vertex_positions": "xyz", "vertex_normals": ("nx", "ny", "nz"), "vertex_texcoords": "uv"}
@@ -73,6 +76,8 @@ class PolygonMesh:
     # `vertex_texcoords` and attributes
     vertices: dict[str, NDArray]
 
+    suffix: ClassVar = ".ply"
+
     def entry(self, bsdf: SceneNode, emitter: SceneNode | None) -> SceneNode:
         """The mesh as an entry of a scene, for `with_meshes` and `save_scene`."""
         # Otherwise Mitsuba would make normals.
@@ -92,6 +97,44 @@ class PolygonMesh:
             columns.update(zip(_BUFFERS.get(name, [f"{stem}_{letter}" for letter in "xyz"]), values.T, strict=False))
         properties = {name: values.astype(np.float32) for name, values in columns.items()}
         write_polygons(path, properties, np.full(len(self.triangles), 3), self.triangles.ravel())
+
+
+@dataclass(frozen=True, eq=False)
+class CurveSet:
+    """Tubes around curves as Mitsuba has them, which reads them from files only."""
+
+    type: str  # "linearcurve" or "bsplinecurve"
+    points: NDArray[np.float64]  # (m, 4): control points and radii
+    counts: IntArray  # (n,): points of each curve
+    textures: SceneNode = field(default_factory=dict)  # Attributes, as parameters of the shape
+    suffix: ClassVar = ".txt"
+
+    def placed(self, matrices: NDArray[np.float64]) -> CurveSet:
+        """Copies with these transforms ``(n, 4, 4)``, with round tubes."""
+        radii = np.cbrt(np.abs(np.linalg.det(matrices[:, :3, :3])))[:, None, None] * self.points[:, 3:]
+        points = np.concatenate([points_at(self.points[:, :3], matrices), radii], axis=2).reshape(-1, 4)
+        return replace(self, points=points, counts=np.tile(self.counts, len(matrices)))
+
+    def entry(self, attributes: Mapping[str, Attribute], bsdf: SceneNode) -> SceneNode:
+        """The shape, with attributes along its segments, as an entry of a scene for `with_meshes` and `save_scene`."""
+        bitmap = {"type": "bitmap", "filter_type": "nearest", "wrap_mode": "clamp", "accel": False}
+        textures: SceneNode = {}
+        for name, attribute in attributes.items():
+            pixels = mi.Bitmap(attribute.values[:, None].astype(np.float32))
+            textures[f"vertex_{name}"] = {**bitmap, "raw": attribute.values.shape[1] == 1, "bitmap": pixels}
+        return {"type": self.type, "mesh": replace(self, textures=textures), **textures, "bsdf": bsdf}
+
+    def loaded(self, bsdf: mi.BSDF, *_: object) -> mi.Object:
+        """The shape as an object of Mitsuba, which neither emits light nor has an interior."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"curves{self.suffix}"
+            self.save(path)
+            return mi.load_dict({"type": self.type, "filename": str(path), **self.textures, "bsdf": bsdf})
+
+    def save(self, path: Path) -> None:
+        """Write the file that Mitsuba reads: a line for each point, and an empty one between curves."""
+        lines = "\n".join("%.9g %.9g %.9g %.9g\n" * count for count in self.counts.tolist())
+        write_text(path, lines % tuple(self.points.ravel().tolist()))
 
 
 def with_meshes(scene: SceneNode) -> SceneNode:

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from mitsuba_subdivision.cage import CageContents
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from mitsuba_subdivision.mitsuba_mesh import CurveSet
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +117,7 @@ class MaterialContents:
 
 @dataclass(frozen=True, eq=False)
 class ShapeContents:
-    """A mesh, or those faces of a mesh that have one material."""
+    """A mesh, those faces of a mesh that have one material, or curves."""
 
     name: str  # Path of the prim
     cage: CageContents  # In the prim's own space. Without a scheme, it is a polygon mesh.
@@ -126,6 +129,7 @@ class ShapeContents:
     # (n,) int: faces with this material, of a limit surface that is evaluated whole; None for all. Parts of polygon
     # meshes and of large surfaces have the other faces as holes.
     shown_faces: NDArray | None = None
+    curves: CurveSet | None = None  # In the prim's own space; then the cage has their points in USD, and no faces
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,6 +180,25 @@ class CameraContents:
     focus_distance: float
     shutter: list[float]  # When it opens and closes, in time codes after the time
     conform_policy: str = "expandAperture"  # For pictures of another aspect ratio; see `sensors.film_window`
+    mitsuba: dict[str, Any] = field(default_factory=dict)  # Parameters of Mitsuba's sensor that the prim states
+
+
+# Of a picture, whose y points up.
+WHOLE = [0.0, 0.0, 1.0, 1.0]
+
+
+@dataclass(frozen=True, eq=False)
+class PictureContents:
+    """Render settings of a stage, with those of its first render product."""
+
+    name: str = ""  # Path of the prim
+    resolution: list[int] | None = None
+    window: list[float] = field(default_factory=lambda: WHOLE)  # Least x and y, then largest, of what is rendered
+    is_transparent: bool = False  # Whether pictures have alpha
+    spp: int | None = None  # Samples per pixel
+    integrator: dict[str, Any] = field(default_factory=dict)  # Parameters of Mitsuba's integrator
+    aovs: dict[str, str] = field(default_factory=dict)  # Types of Mitsuba's AOVs, by the names of their variables
+    products: dict[str, list[str]] = field(default_factory=dict)  # Names of AOVs of products; "" is the colour
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,8 +211,7 @@ class SceneContents:
     instances: list[InstanceContents] = field(default_factory=list)
     lights: list[LightContents] = field(default_factory=list)
     camera: CameraContents | None = None
-    resolution: list[int] | None = None
-    is_transparent: bool = False  # Whether render settings ask for pictures with alpha
+    picture: PictureContents = field(default_factory=PictureContents)
 
     @property
     def all_shapes(self) -> list[ShapeContents]:

@@ -1,8 +1,4 @@
-"""Copies in place of many instances.
-
-Mitsuba's JIT variants trace and compile a separate program for each instance, at a cost that grows with the
-square of their number; see the page of files. One mesh of all copies of a shape has none of that.
-"""
+"""Copies in place of many instances, for which JIT variants compile programs in the square of their number of time."""
 
 from __future__ import annotations
 
@@ -23,11 +19,10 @@ from .stage_warnings import StageWarnings
 
 # Fewer instances cost less than a second in each picture.
 LEAST_INSTANCES = 64
-# From so many faces on, copies load sooner as shapes of their own, which share tables, than as one mesh, and in a third
-# of the memory. Each takes 3 ms of a picture.
+# Faces from which on copies load sooner as shapes of their own than as one mesh, in a third of the memory.
 LARGE = 10_000
 # Of copies as one mesh, measured; and what they may take of the memory of the machine, and at most.
-FACE_BYTES, TRIANGLE_BYTES = {"exact": 600, "vertex": 300}, 170
+FACE_BYTES, TRIANGLE_BYTES, POINT_BYTES = {"exact": 600, "vertex": 300}, 170, 400
 MOST_PART, MOST_BYTES = 0.75, 6e9
 # Of a picture of so many instances, whose time grows with the square of their number.
 MEASURED_INSTANCES, MEASURED_SECONDS = 2_000, 65
@@ -58,18 +53,15 @@ def with_large_copies(contents: SceneContents) -> SceneContents:
 
 def with_copies(
     contents: SceneContents,
-    # dict of (n,) int array by shape: segments on each edge of limit surfaces that their copies need, in the
-    # order of `contents.placed_shapes`
-    rates: Mapping[ShapeContents, IntArray],
+    rates: Mapping[ShapeContents, IntArray],  # (n,) int: segments that copies need, as `placed_shapes` has them
     shading: str,
     notes: StageWarnings,
     *,
     lowest: int = 1,
 ) -> tuple[SceneContents, dict[ShapeContents, int]]:
-    """A scene where copies of a shape are one shape, if there are many; and the rates of such shapes.
+    """A scene where many copies of a shape are one shape for each rate that they need; and the rates of such shapes.
 
-    Copies that need different rates are different shapes. If all would take more than `MOST_BYTES`, their highest rate
-    gives way, down to the lowest; if that is not enough, instances stay.
+    If all would take more than `MOST_BYTES`, the highest rate gives way, down to the lowest; or else instances stay.
     """
     are_many = len(contents.instances) >= LEAST_INSTANCES
     of_group: dict[int, list[NDArray[np.float64]]] = {}
@@ -130,6 +122,7 @@ def _bytes(rates: Mapping[ShapeContents, IntArray], most: int, shading: str) -> 
         corners, faces = int(cage.face_sizes.sum()), len(cage.face_sizes)
         squares = float(np.square(np.minimum(of_copies, most)).sum())
         triangles = corners * squares / 2 if is_smooth else (corners - 2 * faces) * count
+        total += POINT_BYTES * count * (0 if shape.curves is None else len(shape.curves.points))
         total += TRIANGLE_BYTES * triangles + (FACE_BYTES[shading] * faces * count if is_smooth else 0)
     return total
 
@@ -162,6 +155,7 @@ def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> S
         source=CageSource(f"{cage.source.name}, {count} copies"),
     )
     shown = None if shape.shown_faces is None else (shape.shown_faces + face).ravel()
+    shape = replace(shape, curves=shape.curves and shape.curves.placed(matrices))
     return replace(shape, name=name, cage=copied, to_world=np.eye(4), normals=normals, shown_faces=shown)
 
 

@@ -71,10 +71,9 @@ def triangles_for_picture(
 def segments_of(
     contents: SceneContents, surfaces: Surfaces, outline: SceneNode, near_clip: float, shading: str
 ) -> dict[ShapeContents, IntArray]:
-    """Segments on each edge of limit surfaces that a picture needs, at most `FINEST_RATE`; see `segments_for`.
+    """Segments on each edge that a picture needs, ``(n,)``, of the copies of each usable limit surface.
 
-    An array ``(n,)`` for the copies of each shape, in the order of ``contents.placed_shapes``. Cages that cannot be
-    used are missing.
+    See `segments_for`; copies are in the order of ``contents.placed_shapes``.
     """
     of_shape: dict[ShapeContents, list[NDArray[np.float64]]] = {}
     for shape, to_world in contents.placed_shapes:

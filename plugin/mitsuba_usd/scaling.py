@@ -1,12 +1,9 @@
-"""Contents of a stage in another unit, so that the picture is the same.
-
-Mitsuba moves the origins of rays away from surfaces by 9e-5 of a unit, or of the distance from the origin of the world,
-if that is more. So much of a thing of a hundredth of a unit is a hundredth of it: light leaks below what stands on it.
-"""
+"""Contents of a stage in another unit, with the same picture: light leaks below small models (`enlargement`)."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from mitsuba_subdivision.mitsuba_mesh import box_corners, points_at
@@ -62,13 +59,8 @@ def scaled_camera(camera: CameraContents, factor: float) -> CameraContents:
     to_world = camera.to_world.copy()
     to_world[:3, 3] *= factor
     film = 1.0 if camera.is_perspective else factor
-    return replace(
-        camera,
-        to_world=to_world,
-        aperture=[film * length for length in camera.aperture],
-        offset=[film * length for length in camera.offset],
-        near=factor * camera.near,
-        far=factor * camera.far,
-        lens_radius=factor * camera.lens_radius,
-        focus_distance=factor * camera.focus_distance,
-    )
+    changed: dict[str, Any] = {
+        name: factor * getattr(camera, name) for name in ("near", "far", "lens_radius", "focus_distance")
+    }
+    changed |= {name: [film * length for length in getattr(camera, name)] for name in ("aperture", "offset")}
+    return replace(camera, to_world=to_world, **changed)

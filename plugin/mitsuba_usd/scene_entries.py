@@ -1,8 +1,4 @@
-"""Shapes, materials, instances and lights of a stage as entries of a scene.
-
-Limit surfaces become the shape ``subdivision``, polygons meshes: entries, or objects that are kept from frame to frame.
-Cages that are equal share one limit surface.
-"""
+"""Shapes, materials, instances and lights of a stage as entries of a scene, or as objects kept from frame to frame."""
 
 from __future__ import annotations
 
@@ -44,8 +40,7 @@ from .sensors import RESERVED
 from .stage_warnings import StageWarnings
 from .textures import Textures
 
-# From so many faces on, control points stand for the surface, which lies among them and near them: a sphere with 64
-# faces around is smaller than its cage by a six-hundredth of its radius.
+# Faces from which on control points stand for the surface: a sphere with 64 around is smaller by a six-hundredth.
 DENSE = 2_000
 _NO_POINTS: NDArray[np.float64] = np.zeros((0, 3))
 # Fields of a shape that may differ between frames that share an object.
@@ -82,6 +77,8 @@ def scene_entries(
         material, of_shape = shape.material, (chosen or {}).get(shape, parameters)
 
         def entry(with_bsdf: SceneNode) -> SceneNode:
+            if shape.curves is not None:
+                return shape.curves.placed(shape.to_world[None]).entry(shape.cage.attributes, with_bsdf)
             if shape.cage.scheme is None:
                 return {**polygon_mesh(shape).entry(with_bsdf, area), **interior(material)}
             return subdivision(shape, surfaces, with_bsdf, area, {**of_shape, **interior(material)}, notes)
@@ -100,6 +97,8 @@ def scene_entries(
         shining = None if shape.radiance is None else rgb(shape.radiance)
         if shining is None and shape.material is not None:
             shining = radiance(shape.material, textures, notes)
+        if shining is not None and shape.curves is not None:
+            notes.add("emission of curves is ignored; Mitsuba's curves are no lights", shape.name)
         area = None if shining is None else {"type": "area", "radiance": shining}
         try:
             return made(shape, area)
@@ -182,11 +181,7 @@ class Surfaces:
         return alike[-1]
 
     def points(self, contents: SceneContents) -> NDArray[np.float64]:
-        """Points ``(n, 3)`` in the world, all over limit surfaces or around them, and corners of polygons.
-
-        Of groups, there are the corners of their boxes. Where only control points differ from those of an earlier
-        call, weights are made once.
-        """
+        """Points ``(n, 3)`` in the world: on limit surfaces or around them, of other shapes, and boxes of groups."""
         of_shapes = [self._points_of(shape) for shape in counted(contents.shapes, "Limit surfaces")]
         boxes = []
         for group in contents.groups:
@@ -226,8 +221,7 @@ def subdivision(
     surface = surfaces.of(shape.cage)
     for message in surface.warnings:
         notes.add_message(message.replace(surface.contents.source.name, shape.cage.source.name), shape.name)
-    # Any, as the stubs call it an object.
-    tensor: Any = mi.TensorXu
+    tensor: Any = mi.TensorXu  # The stubs call it an object
     shown = shape.shown_faces
     return {
         "type": "subdivision",
@@ -276,11 +270,7 @@ def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
 
 
 class LoadedShapes:
-    """Objects of shapes in successive frames.
-
-    A limit surface that only moves reuses the object of the frame before, with new control points: its patches and
-    weights stay. A polygon mesh that moves is rebuilt.
-    """
+    """Objects of shapes in successive frames. Limit surfaces that only move keep theirs; other shapes are rebuilt."""
 
     def __init__(self) -> None:
         self._before: dict[tuple[str, int], tuple[ShapeContents, mi.Object]] = {}

@@ -6,12 +6,12 @@ import math
 
 import mitsuba as mi
 import numpy as np
-from mitsuba_subdivision.studio import DEFAULT_SIZE, ENVIRONMENT, STUDIO, Look, View, sampler, studio
+from mitsuba_subdivision.studio import DEFAULT_SIZE, DEFAULT_SPP, ENVIRONMENT, STUDIO, Look, View, sampler, studio
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
 from .bsdfs import integrator, rgb
-from .contents import CameraContents, SceneContents
+from .contents import WHOLE, CameraContents, PictureContents, SceneContents
 from .emitters import are_lamps_in_the_way
 from .stage_warnings import StageWarnings
 
@@ -21,12 +21,42 @@ NO_BLUR = "shutters of cameras have no effect without the option --shutter of re
 # Of pictures by a stage's camera.
 WIDTH = 640
 RESERVED = ("integrator", "sensor", *STUDIO, ENVIRONMENT)
-# Half the least size of what the studio is set up around, as a part of its place: a single point has no size.
+# Minimum half-extent of the framed content, relative to its position.
 _LEAST_SIZE = 1e-6
 
 
-def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: StageWarnings) -> SceneNode:
-    """A sensor whose film is the camera's aperture, fitted to the size (width, height) in pixels."""
+def sensor(
+    camera: CameraContents, size: tuple[int, int], picture: PictureContents, spp: int | None, notes: StageWarnings
+) -> SceneNode:
+    """A sensor with a film (width, height) of the camera's aperture, and parameters of Mitsuba that the prim has."""
+    own, stated = _sensor(camera, size, spp, notes), camera.mitsuba
+    stated = {**own, **stated, "film": {**own["film"], **stated.get("film", {})}} if stated else own
+    return cropped(_accepted(stated, own, "mitsuba:sensor", camera.name, notes), picture.window)
+
+
+def _accepted(stated: SceneNode, own: SceneNode, what: str, prim: str, notes: StageWarnings) -> SceneNode:
+    """An entry with parameters that a prim has, or the own one if Mitsuba does not take them."""
+    try:
+        return stated if stated is own or mi.load_dict(stated) else own
+    except RuntimeError as error:
+        notes.add(f"{what} is ignored: {' '.join(str(error).partition(': ')[2].split())}", prim)
+        return own
+
+
+def cropped(sensor: SceneNode, window: list[float]) -> SceneNode:
+    """A sensor that renders the pixels whose centres are in a window; see `PictureContents`."""
+    film, (left, below, right, above) = sensor["film"], window
+    if window == WHOLE:
+        return sensor
+    size = [film.get("crop_width", film["width"]), film.get("crop_height", film["height"])]
+    first, end = np.ceil(np.multiply(size, [[left, 1 - above], [right, 1 - below]]) - 0.5).astype(int)
+    offset = np.add(first, [film.get("crop_offset_x", 0), film.get("crop_offset_y", 0)])
+    numbers = [*np.maximum(end - first, 1).tolist(), *offset.tolist()]
+    names = ("crop_width", "crop_height", "crop_offset_x", "crop_offset_y")
+    return {**sensor, "film": {**film, **dict(zip(names, numbers, strict=True))}}
+
+
+def _sensor(camera: CameraContents, size: tuple[int, int], spp: int | None, notes: StageWarnings) -> SceneNode:
     width, height = size
     wide, high = _film_window(camera, width / height)
     near = max(camera.near, _LEAST_NEAR)
@@ -34,7 +64,7 @@ def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Stage
         notes.add(NO_BLUR, camera.name)
     film = {"type": "hdrfilm", "width": width, "height": height, "component_format": "float32"}
     clip = {"near_clip": near, "far_clip": max(camera.far, 2 * near)}
-    common: SceneNode = {**clip, "film": film, "sampler": sampler(spp)}
+    common: SceneNode = {**clip, "film": film, "sampler": sampler(spp or DEFAULT_SPP)}
     if not camera.is_perspective:
         matrix = camera.to_world.copy()
         matrix[:3, 3] += matrix[:3, :2] @ camera.offset
@@ -44,7 +74,7 @@ def sensor(camera: CameraContents, size: tuple[int, int], spp: int, notes: Stage
     if camera.lens_radius == 0:
         # Of the film's sides; down is positive.
         x, y = camera.offset[0] / wide, -camera.offset[1] / high
-        offset = {"principal_point_offset_x": x, "principal_point_offset_y": y}
+        offset = {"principal_point_offset_x": x, "principal_point_offset_y": y} if x or y else {}
         return {"type": "perspective", **offset, **common, **_field_of_view(wide, camera)}
     # A thin lens has no principal point: the film is a window of a larger one, whose middle is on the axis.
     sides = zip(size, camera.offset, (wide, high), strict=True)
@@ -78,8 +108,8 @@ def size_for(contents: SceneContents, look: Look) -> tuple[int, int]:
     """Size of the film for a stage: 640 pixels wide and as high as the camera's aperture asks for, if none is given."""
     if look.size is not None:
         return look.size
-    if contents.resolution is not None:
-        width, height = contents.resolution
+    if contents.picture.resolution is not None:
+        width, height = contents.picture.resolution
         return width, height
     if contents.camera is None:
         return DEFAULT_SIZE
@@ -114,7 +144,12 @@ def with_studio_defaults(
     entries = studio(bounds, up=contents.up, view=view, size=size, spp=look.spp, points=points, name=name)
     has_clear_lamps = are_lamps_in_the_way(contents.lights, points)
     scene = {"integrator": integrator(contents.materials, entries["integrator"], has_clear_lamps=has_clear_lamps)}
-    scene["sensor"] = entries["sensor"] if camera is None else sensor(camera, size, look.spp, notes)
+    if stated := contents.picture.integrator:
+        own = scene["integrator"]
+        stated = stated if stated.get("type", own["type"]) != own["type"] else {**own, **stated}
+        scene["integrator"] = _accepted(stated, own, "mitsuba:integrator", contents.picture.name, notes)
+    seen = cropped(entries["sensor"], contents.picture.window)
+    scene["sensor"] = seen if camera is None else sensor(camera, size, contents.picture, look.spp, notes)
     if is_lit:
         return scene
     for name in (name for name in STUDIO if name in entries):

@@ -1,4 +1,4 @@
-"""Lights of UsdLux, cameras, and render settings as plain data."""
+"""Lights of UsdLux and cameras as plain data."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from mitsuba_subdivision.files import value_at
 from numpy.typing import NDArray
-from pxr import Usd, UsdGeom, UsdLux, UsdRender
+from pxr import Usd, UsdGeom, UsdLux
 
 from .contents import CameraContents, LightContents
+from .stage_settings import namespaced
 from .stage_warnings import StageWarnings
 
 # Kind of each type, and attributes for its sizes. The schemas of lights say what they are without a value.
@@ -34,27 +35,8 @@ _NEUTRAL_OF_LIGHTS = {
     "inputs:shaping:ies:file": None,
     "inputs:shadow:enable": True,
 }
-# Values of attributes that are ignored, with which they have no effect.
-_NEUTRAL_SETTINGS: dict[str, list[Any]] = {
-    "pixelAspectRatio": [1.0],
-    "dataWindowNDC": [[0, 0, 1, 1]],
-    "includedPurposes": [["default", "render"]],
-    "materialBindingPurposes": [["full", ""], ["full", "preview"]],
-    "renderingColorSpace": ["", "lin_rec709", "lin_rec709_scene"],
-}
-# As Gaffer writes this setting of Cycles.
-_TRANSPARENT = "cycles:background:transparent"
-_NEUTRAL_EXPOSURE = {
-    "exposure": 0.0,
-    "exposure:iso": 100.0,
-    "exposure:time": 1.0,
-    "exposure:fStop": 1.0,
-    "exposure:responsivity": 1.0,
-}
-# The schema's fallback of clippingRange.
-_CLIPPING_RANGE = (1.0, 1e6)
-# Of aspectRatioConformPolicy, as `sensors.film_window` has them.
-_CONFORM_POLICIES = ("expandAperture", "cropAperture", "adjustApertureWidth", "adjustApertureHeight")
+_NEUTRAL_EXPOSURE = {"exposure": 0.0, "exposure:iso": 100.0}
+_NEUTRAL_EXPOSURE |= dict.fromkeys(("exposure:time", "exposure:fStop", "exposure:responsivity"), 1.0)
 # Apertures and focal lengths are in tenths of the world's unit.
 _TENTHS = 0.1
 
@@ -145,47 +127,6 @@ def _texture(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> str | 
     return str(asset.resolvedPath or asset.path)
 
 
-def read_settings(
-    stage: Usd.Stage, time: Usd.TimeCode, notes: StageWarnings
-) -> tuple[dict[str, Any], str | None, dict[str, Any]]:
-    """Fields of `SceneContents` and path of the camera by the stage's render settings; what they change of a camera."""
-    settings = UsdRender.Settings.GetStageRenderSettings(stage)
-    if not settings:
-        others = [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdRender.Settings)]
-        if others or stage.HasAuthoredMetadata("renderSettingsPrimPath"):
-            what = "render settings are those that renderSettingsPrimPath of the stage names; all others are ignored"
-            notes.add(what, ", ".join(others) or str(stage.GetMetadata("renderSettingsPrimPath")))
-        return {}, None, {}
-    prim = settings.GetPrim()
-    path = prim.GetPath()
-
-    def value(name: str) -> Any:
-        return value_at(prim.GetAttribute(name), time)
-
-    for name, neutral in _NEUTRAL_SETTINGS.items():
-        authored = prim.GetAttribute(name).HasAuthoredValue()
-        if authored and not any(np.array_equal(np.asarray(value(name)), usual) for usual in neutral):
-            notes.add(f"{name} of render settings is ignored", path)
-    if settings.GetProductsRel().GetForwardedTargets():
-        notes.add("render products are ignored; the picture is that of the render settings", path)
-    size = np.asarray(value("resolution"))
-    is_size = size.dtype.kind == "i" and size.shape == (2,) and bool((size > 0).all())
-    if not is_size:
-        notes.add("a resolution of render settings that is not two numbers above 0 is ignored", path)
-    policy = str(value("aspectRatioConformPolicy"))
-    if policy not in _CONFORM_POLICIES:
-        notes.add(f'aspectRatioConformPolicy "{policy}" is ignored; {_CONFORM_POLICIES[0]} is used', path)
-        policy = _CONFORM_POLICIES[0]
-    targets = settings.GetCameraRel().GetForwardedTargets()
-    changes: dict[str, Any] = {"conform_policy": policy}
-    if value("disableMotionBlur") or value("instantaneousShutter"):
-        changes["shutter"] = [0.0, 0.0]
-    if value("disableDepthOfField"):
-        changes |= {"lens_radius": 0.0, "focus_distance": 0.0}
-    picture = {"resolution": size.tolist() if is_size else None, "is_transparent": bool(value(_TRANSPARENT))}
-    return picture, str(targets[0]) if targets else None, changes
-
-
 def read_camera(
     camera: UsdGeom.Camera,
     # (4, 4) float64: for column vectors. Scales are left out, as USD's own frustum of a camera has none.
@@ -194,55 +135,47 @@ def read_camera(
     notes: StageWarnings,
 ) -> CameraContents:
     """Read a camera. Raises TypeError, ValueError if it has no image."""
+    prim, path = camera.GetPrim(), camera.GetPath()
     x, y, z = to_world[:3, :3].T
     forward = -z / np.linalg.norm(z)
     up = y - forward * (forward @ y)
     up /= np.linalg.norm(up)
     right = np.cross(forward, up)
     if right @ x < 0:
-        notes.add("reflections in the transforms of cameras are ignored", camera.GetPath())
+        notes.add("reflections in the transforms of cameras are ignored", path)
     rigid = np.eye(4)
     rigid[:3, :3], rigid[:3, 3] = np.stack([right, up, -forward], axis=1), to_world[:3, 3]
 
-    def number(attribute: Usd.Attribute) -> float:
-        return float(value_at(attribute, time))
+    def number(name: str) -> float:
+        return float(value_at(prim.GetAttribute(name), time))
 
     projection = str(value_at(camera.GetProjectionAttr(), time))
     if projection not in ("perspective", "orthographic"):
-        notes.add(f'the projection "{projection}" of cameras is ignored, and perspective is used', camera.GetPath())
+        notes.add(f'the projection "{projection}" of cameras is ignored, and perspective is used', path)
     is_perspective = projection != "orthographic"
     unit = 1.0 if is_perspective else _TENTHS
-    aperture = [number(camera.GetHorizontalApertureAttr()), number(camera.GetVerticalApertureAttr())]
-    offset = [number(camera.GetHorizontalApertureOffsetAttr()), number(camera.GetVerticalApertureOffsetAttr())]
-    shutter = [number(camera.GetShutterOpenAttr()), number(camera.GetShutterCloseAttr())]
+    sides = ("horizontalAperture", "verticalAperture")
+    film = [unit * number(side) for side in sides], [unit * number(f"{side}Offset") for side in sides]
+    shutter = [number("shutter:open"), number("shutter:close")]
     near, far = value_at(camera.GetClippingRangeAttr(), time)
     if not near <= far:
-        notes.add("a clippingRange of cameras that is not from a number to a larger one is ignored", camera.GetPath())
-        near, far = _CLIPPING_RANGE
-    focal_length, f_stop = number(camera.GetFocalLengthAttr()), number(camera.GetFStopAttr())
-    focus = number(camera.GetFocusDistanceAttr())
+        notes.add("a clippingRange of cameras that is not from a number to a larger one is ignored", path)
+        near, far = 1.0, 1e6  # As the schema has them
+    focal_length, f_stop, focus = number("focalLength"), number("fStop"), number("focusDistance")
     has_lens = is_perspective and f_stop > 0 and focus > 0
     if is_perspective and f_stop > 0 >= focus:
-        notes.add("fStop of cameras without a focusDistance above 0 is ignored", camera.GetPath())
+        notes.add("fStop of cameras without a focusDistance above 0 is ignored", path)
     for name, neutral in _NEUTRAL_EXPOSURE.items():
-        attribute = camera.GetPrim().GetAttribute(name)
-        if attribute and value_at(attribute, time) != neutral:
-            notes.add(f"{name} of cameras is ignored; pictures have the radiance of the scene", camera.GetPath())
+        if value_at(prim.GetAttribute(name), time) not in (None, neutral):
+            notes.add(f"{name} of cameras is ignored; pictures have the radiance of the scene", path)
     if value_at(camera.GetClippingPlanesAttr(), time):
-        notes.add("clippingPlanes of cameras are ignored", camera.GetPath())
-    numbers = [*to_world.ravel(), *aperture, *offset, focal_length, near, far, focus if has_lens else 0, *shutter]
-    if not np.isfinite(numbers).all() or min(*aperture, focal_length) <= 0:
+        notes.add("clippingPlanes of cameras are ignored", path)
+    lens = (_TENTHS * focal_length / (2 * f_stop), focus) if has_lens else (0.0, 0.0)
+    numbers = focal_length, float(near), float(far), *lens
+    if (
+        not np.isfinite([*to_world.ravel(), *film[0], *film[1], *numbers, *shutter]).all()
+        or min(*film[0], numbers[0]) <= 0
+    ):
         raise ValueError("the camera has no image")
-    return CameraContents(
-        str(camera.GetPath()),
-        rigid,
-        is_perspective,
-        [unit * length for length in aperture],
-        [unit * length for length in offset],
-        focal_length,
-        float(near),
-        float(far),
-        _TENTHS * focal_length / (2 * f_stop) if has_lens else 0.0,
-        focus if has_lens else 0.0,
-        shutter,
-    )
+    stated = namespaced(prim, "mitsuba:sensor", time)
+    return CameraContents(str(path), rigid, is_perspective, *film, *numbers, shutter, mitsuba=stated)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pxr import Usd, UsdGeom, UsdLux, UsdShade
 
 from .contents import MaterialContents, ShapeContents
+from .stage_curves import read_curves
 from .stage_lights_and_camera import read_emission
 from .stage_materials import MaterialReader
 from .stage_warnings import StageWarnings
@@ -48,8 +49,16 @@ class ShapeReader:
             if str(prim.GetTypeName()) not in GPRIMS:
                 return self._parts(prim, to_world, location)
             require_types(prim, self._time)
+            material = self._materials.bound(prim)
+            if str(prim.GetTypeName()) == "BasisCurves":
+                names = COLORS if material is None else tuple(sorted(material.primvars()))
+                if material is not None and material.texcoords():
+                    what = "textures of curves are looked up around them, and along all curves of a prim"
+                    self._notes.add(what, prim.GetPath())
+                cage, curves = read_curves(prim, to_world, self._time, names, self._notes)
+                return [replace(self._shape(prim, to_world, cage, None, material), curves=curves)]
             cage, normals = read_gprim(prim, self._time)
-            return [self._shape(prim, to_world, cage, normals, self._materials.bound(prim))]
+            return [self._shape(prim, to_world, cage, normals, material)]
 
     def _parts(self, prim: Usd.Prim, to_world: NDArray[np.float64], location: str) -> list[ShapeContents]:
         mesh = UsdGeom.Mesh(prim)
@@ -252,4 +261,4 @@ _OUTLINES: dict[str, Callable[[float, float], list[Line]]] = {
     "Cone": lambda r, h: _lines((0, -h), (r, -h), (0, h)),
     "Capsule": lambda r, h: [_arc(r, -90, 0, -h), *_lines((r, -h), (r, h)), _arc(r, 0, 90, h)],
 }
-GPRIMS = ("Cube", "Plane", *_OUTLINES)
+GPRIMS = ("Cube", "Plane", *_OUTLINES, "BasisCurves")

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from .stage_walk import StageReader
 
 # What differs between contents where only the camera does.
-_OF_CAMERA = frozenset({"camera", "resolution", "is_transparent"})
+_OF_CAMERA = frozenset({"camera", "picture"})
 # Names of parameters of sensors that `mi.traverse` has others for; the field of view is along x.
 _TRAVERSED = {"fov": "x_fov"}
 
@@ -56,17 +56,14 @@ class StageScenes:
         time: float | None = None,
         camera: str | None = None,  # Path of the stage's camera
         numbers: range | None = None,  # Times or numbers of files, if there are frames
-        # Number of the sub-frames of each frame, which share its samples. Their times are the middles of
-        # equal parts of the interval in which the shutter of the first frame's camera is open.
-        shutter: int | None = None,
+        shutter: int | None = None,  # Sub-frames of each frame, which share its samples; see `_delays`
         # When the shutter opens and closes, in time codes after the time; by default, as its camera says
         interval: tuple[float, float] | None = None,
         over: str | Path | None = None,  # A layer that is stronger than each file
     ) -> None:
         self.name = f'"{path}"'
         self._shutter, self._interval, self._over = shutter, interval, over
-        look = replace(look, spp=-(-look.spp // (shutter or 1)))
-        self._path, self._look, self._parameters = path, look, parameters
+        self._path, self._look, self._spp, self._parameters = path, look, look.spp, parameters
         self._time, self._camera = time, camera
         self._has_free_rates = not is_chosen(parameters)
         self._files = None if numbers is None else studio.FrameFiles(Path(path), numbers)
@@ -108,14 +105,18 @@ class StageScenes:
             contents = with_large_copies(contents)
         if self._look.environment is not None:
             dark = [replace(shape, radiance=None) for shape in contents.shapes]
-            is_dark = all(shape.radiance is None for shape in contents.shapes)
-            contents = replace(contents, lights=[], shapes=contents.shapes if is_dark else dark)
+            shines = any(shape.radiance is not None for shape in contents.shapes)
+            contents = replace(contents, lights=[], shapes=dark if shines else contents.shapes)
         self._parameters = with_rate(self._parameters, contents)
         if contents.has_surfaces:
             shading = studio.shading_for(studio.variant_in_use(), self._parameters)
             self._parameters = {**self._parameters, "shading": shading}
         self._is_lit |= contents.is_lit
-        self._look = replace(self._look, transparent=self._look.transparent or contents.is_transparent)
+        look, picture = self._look, contents.picture
+        spp = (picture.spp or studio.DEFAULT_SPP) if self._spp is None else self._spp
+        self.aovs, self.products = {} if look.aovs is None else {**picture.aovs, **look.aovs}, picture.products
+        is_transparent = look.transparent or picture.is_transparent
+        self._look = replace(look, spp=-(-spp // (self._shutter or 1)), transparent=is_transparent, aovs=self.aovs)
         return contents
 
     def _enlarged(self, given: SceneContents) -> SceneContents:
@@ -127,10 +128,10 @@ class StageScenes:
         if self._before is None or self._before[0].shapes is not given.shapes:
             self._before = given, scaled(given, self.factor)
         camera = None if given.camera is None else scaled_camera(given.camera, self.factor)
-        return replace(self._before[1], camera=camera, resolution=given.resolution)
+        return replace(self._before[1], camera=camera, picture=given.picture)
 
     def _delays(self, first: SceneContents) -> list[float]:
-        """Times of sub-frames after the time of a frame."""
+        """Times of sub-frames after that of a frame: middles of equal parts of the first camera's open shutter."""
         if self._shutter is None:
             return [0.0]
         opens, closes = self._interval or (first.camera.shutter if first.camera else (0.0, 0.0))
@@ -269,7 +270,7 @@ class StageScenes:
         """The camera of a frame."""
         if contents.camera is None:
             return dict(rest["sensor"])
-        return sensor(contents.camera, size_for(first, self._look), self._look.spp, self._notes)
+        return sensor(contents.camera, size_for(first, self._look), contents.picture, self._look.spp, self._notes)
 
     def _texels_for_frames(self, first: SceneContents, rest: SceneNode) -> dict[str, float]:
         """Pixels along the sides of textures that any frame shows; of all frames, so that textures do not change."""
@@ -311,7 +312,7 @@ def usd_scene(
     time: float | None = None,
     camera: str | None = None,
     size: tuple[int, int] | None = None,
-    spp: int = studio.DEFAULT_SPP,
+    spp: int | None = None,
     view: studio.View = studio.DEFAULT_VIEW,
     texture_size: int | None = None,
     transparent: bool = False,
@@ -330,34 +331,29 @@ def usd_scene(
     path : str or Path
         A ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` file.
     mi : module or str
-        ``mitsuba`` with a variant set, a variant such as ``mitsuba.llvm_ad_rgb``, or its name, "llvm_ad_rgb". The scene
-        is for this variant.
+        ``mitsuba`` with a variant set, a variant such as ``mitsuba.llvm_ad_rgb``, or its name: that of the scene.
     time : float, optional
         Time code. By default, each value is the one that does not depend on time, or else its first sample.
     camera : str, optional
-        Path of the camera, such as "/World/camera", or its name. By default that of the stage's render settings, or its
-        first one.
+        Path of the camera, such as "/World/camera", or its name. By default that of the render settings, or the first.
     size : (width, height), optional
-        Of the film, in pixels. By default what the stage's render settings say, or 640 pixels wide and as high as the
-        camera's aperture asks for.
-    spp : int
-        Samples per pixel.
+        Pixels of the film. By default those of the render settings, or 640 by as many as the camera's aperture has.
+    spp : int, optional
+        Samples per pixel. By default those of the render settings, or 64.
     view : str or (azimuth, elevation)
         View of the studio's camera, if the stage has no camera.
     texture_size : int, optional
-        Pixels along the sides of the textures of materials at most; each tile of a UDIM texture is such a texture.
-        Textures that are finer than this camera shows are halved in any case.
+        Pixels along the sides of textures and UDIM tiles at most. Finer ones than the camera shows are halved.
     transparent : bool
-        Whether pictures have alpha and no background, as where render settings of the stage ask for a ``RenderVar``
-        with alpha. The camera sees no environment, no lamps and no backdrop; meshes that emit light it sees.
+        Whether pictures have alpha and no background, which render settings can ask for, too. The camera sees no
+        environment, no lamps and no backdrop; meshes that emit light it sees.
     over : str or Path, optional
         A USD layer that is stronger than the file: materials, lights, cameras, visibility.
     **parameters
         Of every shape ``subdivision``, such as ``tessellation_rate=4`` or ``shading="vertex"``. By default shading is
-        exact where ``shading="auto"`` is; elsewhere a line on standard error says why. Triangles are as few as the
-        picture shows, about 4 million at most. With exact shading, outlines are a tenth of a pixel away from the
-        surface as this camera sees them; outside groups, triangles adapt to that. Otherwise all triangles are a 32nd of
-        a pixel away, with 8 segments on each edge at most.
+        that of ``shading="auto"``, and triangles are as few as the picture shows, about 4 million at most. With exact
+        shading, outlines are a tenth of a pixel away from the surface as this camera sees them; outside groups,
+        triangles adapt to that. Otherwise all are a 32nd of a pixel away, with 8 segments on each edge at most.
 
     Returns
     -------
@@ -367,7 +363,7 @@ def usd_scene(
     Raises
     ------
     CageError
-        If the package usd-core is missing; if the file is malformed; if there is no such camera, or nothing is visible.
+        If usd-core is missing, the file is malformed, there is no such camera, or nothing is visible.
     ValueError
         If the time, the size, the samples or the texture size are none, or ``mi`` is no variant.
     OSError

@@ -1,8 +1,4 @@
-"""A whole USD stage as plain data: its meshes, instances, lights and its camera.
-
-Invisible prims, guides and proxies are skipped. Instances of a prototype that look the same become one group of shapes;
-where that cannot be, they are copies.
-"""
+"""The visible prims of a whole USD stage as plain data. Instances that look the same are one group, or else copies."""
 
 from __future__ import annotations
 
@@ -12,7 +8,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mitsuba_subdivision import files
@@ -21,11 +16,12 @@ from mitsuba_subdivision.messages import timed
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdLux, UsdShade, UsdSkel
 
-from .contents import CameraContents, InstanceContents, MaterialContents, SceneContents
+from .contents import CameraContents, InstanceContents, MaterialContents, PictureContents, SceneContents
 from .materialx_layers import with_documents
-from .stage_lights_and_camera import read_camera, read_emission, read_light, read_settings
+from .stage_lights_and_camera import read_camera, read_emission, read_light
 from .stage_materials import MaterialReader
 from .stage_meshes import COLORS, GPRIMS, ShapeReader, are_invertible
+from .stage_settings import read_settings
 from .stage_warnings import StageWarnings
 
 # Draw modes by which a viewer shows a model as it is.
@@ -55,10 +51,7 @@ class StageReader:
         self._before: SceneContents | None = None
 
     def at(self, time: float | None = None) -> SceneContents:
-        """Contents of the stage at a time code. Warns about everything that is ignored, once for each kind.
-
-        Without a time code, each value is the one that does not depend on time, or else its first sample.
-        """
+        """Contents at a time code; by default, of values without time, or first samples. Warns of what is ignored."""
         name = f'"{self._path}"'
         if time is not None and not math.isfinite(time):
             raise ValueError(f"{name}: time {time}; expected a finite number, a time code")
@@ -68,7 +61,7 @@ class StageReader:
                 walk = _StageWalk(self._stage, name, time, self._notes, at)
                 if self._before is not None and self._is_still:
                     camera, picture = walk.camera(self._camera)
-                    return replace(self._before, camera=camera, **picture)
+                    return replace(self._before, camera=camera, picture=picture)
                 self._before = walk.contents(self._camera)
                 return self._before
 
@@ -155,13 +148,10 @@ class _StageWalk:
                 _add_copy(whole, prototype, instance)
         groups = [self._prototypes[number].shapes for number in numbers]
         chosen, picture = self.camera(camera)
-        return SceneContents(up, whole.shapes, groups, instances, whole.lights, chosen, **picture)
+        return SceneContents(up, whole.shapes, groups, instances, whole.lights, chosen, picture)
 
-    def camera(self, wanted: str | None) -> tuple[CameraContents | None, dict[str, Any]]:
-        """The camera, None if there is none, and fields of `SceneContents` by the stage's render settings.
-
-        A camera is wanted by its path, or by its name if no other camera has it.
-        """
+    def camera(self, wanted: str | None) -> tuple[CameraContents | None, PictureContents]:
+        """The camera of a path, or of a name that no other has; None if there is none; and the render settings."""
         picture, named, changes = read_settings(self._stage, self._code, self._notes)
         path = wanted or named
         prims = self._stage.Traverse(Usd.TraverseInstanceProxies())
@@ -245,6 +235,8 @@ class _StageWalk:
         elif prim.IsA(UsdGeom.PointInstancer):
             below.instances.extend(self._point_instances(UsdGeom.PointInstancer(prim), name, matrix()))
         elif prim.IsA(UsdGeom.Mesh) or str(prim.GetTypeName()) in GPRIMS:
+            if prim.HasAttribute("mitsuba:sensor"):
+                self._notes.add("mitsuba:sensor of shapes is ignored; pictures are those of cameras", prim.GetPath())
             below.shapes.extend(replace(shape, name=name) for shape in self._shapes.read(prim, matrix()))
         elif prim.HasAPI(UsdLux.LightAPI):
             files.require_types(prim, self._code)
@@ -377,10 +369,7 @@ def _add_copy(contents: SceneContents, prototype: SceneContents, instance: Insta
 
 
 def _can_be_instanced(prototype: SceneContents) -> bool:
-    """Whether Mitsuba has instances of a prototype.
-
-    Instances cannot be emitters, and where they are hit, attributes of meshes are looked up in the wrong place.
-    """
+    """Whether Mitsuba has instances of a prototype: no emitters, nor attributes, which it looks up in another place."""
     is_hindered = (
         shape.radiance is not None
         or bool(shape.cage.attributes)

@@ -57,7 +57,7 @@ WRITTEN = {
     "files": {"barrel.usda", "human.ply", "barrel.ply"},
     "fitting": {"found.obj", "fit.npz"},
     "python": {"barrel.obj"},
-    "render": {"human.png", "jar.png", "rook.xml", "edited.png", "warm.png", "turn_0003.png", "turn.gif"},
+    "render": {"human.png", "jar.png", "rook.exr", "rook.xml", "edited.png", "warm.png", "turn_0003.png", "turn.gif"},
 }
 # References are written, and compared.
 PYTEST_TWICE = """import pytest

@@ -68,6 +68,14 @@ def test_options_of_mitsubas_own_program(folder):
     assert pixels("b.exr").shape[:2] == (8, 8)
 
 
+@pytest.mark.usefixtures("folder")
+def test_channels_by_name():
+    assert render("cube.obj", "-o", "a.exr", *SMALL, "--aov", "normals,z") == 0
+    names = {field.name for field in mi.Bitmap("a.exr").struct_()}
+    assert names == {"R", "G", "B", "normals.X", "normals.Y", "normals.Z", "z.T"}
+    assert render("cube.obj", "-o", "a.png", *SMALL, "--aov", "normals,z") == 1
+
+
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="a process cannot be kept to one core here")
 def test_one_core_reads_and_writes_openexr(folder):
     """A picture, and passes."""

@@ -354,11 +354,11 @@ def test_textures_are_as_fine_as_the_frame_that_shows_most_of_them_needs(sides):
 @scalar
 def test_warnings_of_all_frames_are_told_once(tmp_path):
     fin = CUBE.replace("4]", "4, 4]", 1).replace("7,5]", "7,5, 0,1,7,6]")
-    path = write(tmp_path, prim("Mesh", "fin", fin) + prim("BasisCurves", "hair") + LAMP)
+    path = write(tmp_path, prim("Mesh", "fin", fin) + prim("Points", "hair") + LAMP)
     shown, messages = told(lambda: [*frame_range(path, range(1, 3)).frames([1, 2], "box")])
     assert (len(shown), len(messages)) == (2, 2)
     messages.sort(key=len)
-    assert "BasisCurves are ignored (/hair)" in messages[0]
+    assert "Points are ignored (/hair)" in messages[0]
     assert "prim /fin: the faces are no manifold" in messages[1]
 
 

@@ -14,6 +14,7 @@ from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
 from mitsuba_subdivision.cage.contents import same
 from mitsuba_usd import materialx_layers, stage_meshes
+from mitsuba_usd.stage_settings import read_variant
 from mitsuba_usd.stage_walk import StageReader
 from mitsuba_usd.texture_image import read_texture_image
 from scipy.spatial import cKDTree
@@ -262,7 +263,7 @@ def test_every_value_of_a_prim_is_its_default_or_else_its_first_sample(stage):
 
     plain, alone = contents("default"), cage("default", [])
     assert {shape.name for shape in plain.shapes} == {"/cube", "/sheet"}
-    assert (plain.camera.focal_length, plain.lights[0].size, plain.resolution) == (70, [2], [20, 10])
+    assert (plain.camera.focal_length, plain.lights[0].size, plain.picture.resolution) == (70, [2], [20, 10])
     assert [len(tags) for tags in (alone.creases, alone.corners, alone.holes)] == [1, 1, 1]
     for stored in ("samples", "both"):
         assert same(contents(stored), plain)
@@ -354,12 +355,12 @@ def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(s
     shown["bilinear"] = 'uniform token subdivisionScheme = "bilinear"'
     text = "".join(mesh(name, CUBE, line) for name, line in {**hidden, **shown}.items())
     text += mesh("broken", CUBE.replace("5]", "50]")) + prim("Scope", "off", invisible, mesh("below", CUBE))
-    text += "".join(prim("BasisCurves", f"c{n}") for n in range(5))
+    text += "".join(prim("Points", f"c{n}") for n in range(5))
     entries, messages = told(scene, text)
     assert {*hidden, *shown, "broken", "off_below"} & entries.keys() == {*shown}
     expected = (
         "draw modes of models are ignored; their meshes are shown (/rendered)",
-        "BasisCurves are ignored (/c0, /c1, /c2 and 2 more)",
+        "Points are ignored (/c0, /c1, /c2 and 2 more)",
         "scheme bilinear become polygons (/bilinear)",
         "/broken...; the prim is left out",
     )
@@ -810,7 +811,7 @@ def test_the_aperture_fits_the_picture_as_render_settings_say(scene, projection,
     text = settings(RESOLUTION, f'uniform token aspectRatioConformPolicy = "{policy}"')
     text += camera(f'token projection = "{projection}"', aperture=3) + mesh("cube", CUBE)
     entries, messages = told(scene, text, NAMED)
-    is_told = ['aspectRatioConformPolicy "adjustPixelAspectRatio" is ignored' in message for message in messages]
+    is_told = ["aspectRatioConformPolicy of render settings is ignored; " in message for message in messages]
     assert is_told == [True] * ("Pixel" in policy)
     sensor = mi.load_dict(entries["sensor"])
     assert tuple(sensor.film().size()) == (40, 20)
@@ -825,17 +826,21 @@ def frame(setting="", of_camera=""):
     return settings("" if "resolution" in setting else RESOLUTION, setting) + camera(of_camera)
 
 
-OTHER_SETTINGS = ["float pixelAspectRatio = 2", "float4 dataWindowNDC = (0, 0, 0.5, 1)"]
+OTHER_SETTINGS = ["float pixelAspectRatio = 2", "float4 dataWindowNDC = (0.5, 0, 0.5, 1)"]
 OTHER_SETTINGS += ['token[] includedPurposes = ["default", "proxy"]', 'token[] materialBindingPurposes = ["preview"]']
 OTHER_SETTINGS += ['token renderingColorSpace = "acescg"']
 IGNORED_SETTINGS = [
     *((f"uniform {line}", f"{line.split()[1]} of render settings is ignored") for line in OTHER_SETTINGS),
-    ("rel products = </product>", "render products are ignored; the picture is that of the render settings"),
-    ('uniform token aspectRatioConformPolicy = "other"', 'aspectRatioConformPolicy "other" is ignored; expand'),
-    ("uniform int2 resolution = (0, 20)", "a resolution of render settings that is not two numbers above 0"),
-    ('uniform token resolution = "large"', "a resolution of render settings that is not two numbers above 0"),
+    ("int mitsuba:integrator:gain = 2", "mitsuba:integrator is ignored: "),
+    ("int mitsuba:sample_count = 0", "mitsuba:sample_count of render settings is ignored; expected a number above 0"),
+    ("rel products = </product>", "productType of render settings is ignored"),
+    ("uniform float4 dataWindowNDC = (0, 0, 1.5, 1)", "dataWindowNDC of render settings is cut to the picture"),
+    ('uniform token aspectRatioConformPolicy = "other"', "aspectRatioConformPolicy of render settings is ignored; exp"),
+    ("uniform int2 resolution = (0, 20)", "resolution of render settings is ignored; expected two numbers above 0"),
+    ('uniform token resolution = "large"', "resolution of render settings is ignored; expected two numbers above 0"),
 ]
 IGNORED_OF_CAMERAS = [
+    ('string mitsuba:sensor:type = "irradiancemeter"', "mitsuba:sensor is ignored: "),
     ("float exposure = 1", "exposure of cameras is ignored; pictures have the radiance of the scene"),
     *((f"float exposure:{name} = 2", f"exposure:{name} of cameras is ignored") for name in ("iso", "time", "fStop")),
     ("float exposure:responsivity = 2", "exposure:responsivity of cameras is ignored"),
@@ -873,16 +878,28 @@ TEXTURED = texture("black.png") + transform("place", "float2 inputs:pivot = (1, 
 TEXTURED = material(COLORED, TEXTURED) + mesh("textured", SQUARE, bound())
 
 
+def render_product(name, variables, *lines, **of_variables):
+    """A render product, and render variables by their sources."""
+    targets = ", ".join(f"</{variable}>" for variable in variables.split())
+    lines = (f'token productName = "/out/{name}.exr"', f"rel orderedVars = [{targets}]", *lines)
+    sources = ((variable, f'uniform string sourceName = "{source}"') for variable, source in of_variables.items())
+    return prim("RenderProduct", name, *lines) + "".join(prim("RenderVar", *source) for source in sources)
+
+
 def changed(old, new):
     assert old in TEXTURED
     return TEXTURED.replace(old, new.replace("...", old), 2 if old in ('"repeat"', "outputs:rgb") else 1)
 
 
+SMALLER = render_product("p", "") + render_product("q", "", "uniform int2 resolution = (4, 4)")
 # Stages, what is told of them, and how that ends.
 IGNORED = [
     *((frame(line), message, "(/settings)") for line, message in IGNORED_SETTINGS),
     *((frame(of_camera=line), message, "(/camera)") for line, message in IGNORED_OF_CAMERAS),
     *((light("SphereLight", line, apis=SHAPED), message, "(/lamp)") for line, message in IGNORED_OF_LIGHTS),
+    (mesh("cube", CUBE, 'string mitsuba:sensor = "/a"'), "mitsuba:sensor of shapes is ignored; ", "(/cube)"),
+    (frame("rel products = </p>") + render_product("p", "v", v="lpe:C<RD>"), 'source "lpe:C<RD>" are ignored', "(/v)"),
+    (frame("rel products = [</p>, </q>]") + SMALLER, "resolution of render products is ignored; the first", "(/q)"),
     (light("DiskLight", f"{CONE}40"), "shaping:cone:angle of lights is ignored; ", "(/lamp)"),
     *((changed(old, new), message, ")") for old, new, message in IGNORED_INPUTS),
 ]
@@ -891,7 +908,7 @@ IGNORED = [
 @pytest.mark.parametrize(("text", "message", "end"), IGNORED)
 def test_what_is_not_followed_is_told_once_by_name(scene, tmp_path, text, message, end):
     stages.flat(tmp_path / "black.png", [0, 0, 0])
-    text += prim("RenderProduct", "product") + mesh("square", SQUARE)
+    text += prim("RenderProduct", "product", 'uniform token productType = "deepRaster"') + mesh("square", SQUARE)
     entries, (warning,) = told(scene, text, NAMED if "settings" in text else "")
     assert message in warning
     assert warning.endswith(end)
@@ -902,7 +919,56 @@ def test_what_is_not_followed_is_told_once_by_name(scene, tmp_path, text, messag
 def test_render_settings_that_the_stage_does_not_name_are_told(stage, head):
     path = stage(settings(RESOLUTION) + CAMERA + mesh("cube", CUBE), head=head)
     with pytest.warns(CageWarning, match=r"render settings are those that .* all others are ignored \(/settings\)"):
-        assert StageReader(path).at().resolution is None
+        assert StageReader(path).at().picture.resolution is None
+
+
+# Sources of render variables, and types of Mitsuba's AOVs.
+AOVS = {"d": ("depth", "depth"), "N": ("normal", "sh_normal"), "x": ("P", "position"), "id": ("primId", "shape_index")}
+# Rounding in a scene that is larger by a power of two.
+LARGER = 1e-4
+
+
+def test_products_are_files_with_named_channels_of_mitsubas_integrator(stage, tmp_path, monkeypatch):
+    """Of a small model, with lengths of the stage."""
+    monkeypatch.chdir(tmp_path)
+    text = render_product("first", "beauty d N", beauty="raw", **{name: source for name, (source, _) in AOVS.items()})
+    text += render_product("second", "d x id") + mesh("square", SQUARE, moved(rotateY=20, scale=(0.05, 0.05, 0.05)))
+    text += camera("float2 clippingRange = (0.01, 9)", placed=moved(translate=(0, 0, 0.5)))
+    common = [RESOLUTION, "int mitsuba:sample_count = 4", 'string mitsuba:variant = "scalar_rgb"']
+    path = stage(settings(*common, "rel products = [</first>, </second>]") + text, head=NAMED)
+    assert main(["render", str(path), "-o", "a.exr", "--filter", "box"]) == 0
+    entries = msub.usd_scene(path, mi)
+    aovs = ",".join(f"{name}:{kind}" for name, (_, kind) in AOVS.items())
+    entries["integrator"] = {"type": "aov", "aovs": aovs, "image": entries["integrator"]}
+    entries["sensor"]["film"]["rfilter"] = {"type": "box"}
+    plain = mi.load_dict(entries)
+    pixels = np.moveaxis(np.array(mi.render(plain)), 2, 0)
+    expected = dict(zip(["R", "G", "B", *plain.integrator().aov_names()[4:]], pixels, strict=True))
+    files = (OpenEXR.File(f"a{name}.exr", separate_channels=True).channels() for name in ("", "_first", "_second"))
+    whole, first, second = files
+    assert [whole.keys(), first.keys()] == [expected.keys(), {"R", "G", "B", "d.T", "N.X", "N.Y", "N.Z"}]
+    assert second.keys() == {"d.T", "x.X", "x.Y", "x.Z", "id.I"}
+    for name, channel in (pair for file in (whole, first, second) for pair in file.items()):
+        np.testing.assert_allclose(channel.pixels, expected[name], atol=LARGER)
+    assert first["d.T"].pixels.max() > 0.4
+
+
+def test_parameters_of_mitsuba_and_a_crop(stage):
+    """Pixels with their centres in the window are rendered; options, and layers over a stage, are stronger."""
+    given = [RESOLUTION, "int mitsuba:sample_count = 16", "uniform float4 dataWindowNDC = (0.26, 0, 1, 0.5)"]
+    given += ['string mitsuba:integrator:type = "direct"', "int mitsuba:integrator:emitter_samples = 2"]
+    lens = ['string mitsuba:sensor:type = "thinlens"', "float mitsuba:sensor:aperture_radius = 0.5"]
+    lens += ["float mitsuba:sensor:focus_distance = 3", 'string mitsuba:sensor:film:filter:type = "box"']
+    text = settings(*given, 'string mitsuba:variant = "scalar_mono"') + camera(*lens) + mesh("cube", CUBE)
+    path, over = stage(text, head=NAMED), stage('over "settings" {\nstring mitsuba:variant = "a"\n}', "over.usda")
+    assert (read_variant(path, None), read_variant(path, over)) == ("scalar_mono", "a")
+    entries = msub.usd_scene(path, mi)
+    assert entries["integrator"] == {"type": "direct", "emitter_samples": 2}
+    sensor = mi.load_dict(entries["sensor"])
+    assert (entries["sensor"]["aperture_radius"], sensor.sampler().sample_count()) == (0.5, 16)
+    assert "BoxFilter" in str(sensor.film().rfilter())
+    assert [*sensor.film().crop_size(), *sensor.film().crop_offset()] == [30, 10, 10, 10]
+    assert msub.usd_scene(path, mi, spp=4)["sensor"]["sampler"]["sample_count"] == 4
 
 
 def test_of_several_cameras_the_first_is_used_and_told(stage):

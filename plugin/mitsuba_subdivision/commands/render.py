@@ -22,18 +22,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.errors import CageWarning, warn
+from ..files import require_usd
 from ..files.formats import FORMATS
 from ..messages import counted, print_remark, print_result
 from ..regression.image import METADATA_ATTRIBUTE
 from ..regression.scene import BOX, LoadedScene, kept_search_folders, load_scene, render_image
 from ..regression.tiers import Tolerances
 from ..shapes.parameter_table import SHADINGS
+from ..studio import AOVS, DEFAULT_VIEW, Look, sampler, variant_in_use
 from ..studio.animation import FrameRange, StillPicture, Turntable
 from ..studio.cage_scenes import CageScenes
 from ..studio.picture import denoised, require_denoiser, shading_for, weigh_lights
 from ..studio.saving import save_scene
-from ..studio.studio_entries import DEFAULT_VIEW, UP_AXES, VIEWS, Environment, Look, sampler, variant_in_use
-from ..variants import set_variant, threads_set
+from ..studio.studio_entries import LENGTHS, UP_AXES, VIEWS, Environment
+from ..variants import set_variant, threads_set, variant_problem
 from ..whole_file import require_writable, whole_file
 from .arguments import CommandParser, above_zero, add_cage_options, add_variant, checked, finite, index, positive, seed
 from .compare import TOLERANCES, add_tolerances
@@ -45,7 +47,7 @@ DEFAULT_FPS = 24
 # Options about models, by the names that they have after parsing; others are about every scene.
 _OF_MODELS = (
     "view", "azimuth", "elevation", "up", "size", "scheme", "prim", "time", "rate", "shading", "checker", "cage",
-    "texture_size", "camera", "over", "environment", "no_studio", "transparent",
+    "texture_size", "camera", "over", "environment", "no_studio", "transparent", "aovs",
 )  # fmt: skip
 _OF_FRAMES = ("turntable", "frames", "shutter", "fps")
 # Options that select one mesh of a USD file, and those of whole ones.
@@ -54,7 +56,7 @@ _OF_STAGES = ("shutter", "texture_size", "camera", "over")
 # Options that do not apply to a model's scene.
 _OF_SCENES = ("parameters", "sensor", "share", "reference", "tolerances")
 # Options that `Look` has by the same names.
-_OF_LOOK = ("up", "size", "spp", "rate", "checker", "cage", "texture_size", "environment", "transparent")
+_OF_LOOK = ("up", "size", "spp", "rate", "checker", "cage", "texture_size", "environment", "transparent", "aovs")
 # Suffixes of files that Blender reads, and writes as USD files.
 _OF_BLENDER = (".blend", ".fbx", ".gltf", ".glb", ".abc", ".dae", ".stl", ".3ds")
 # Sub-frames of an interval.
@@ -62,6 +64,14 @@ SUB_FRAMES = 16
 _WITH_ALPHA = (".exr", ".png")
 # Sides of the pictures in an MP4 file are multiples of this; others lose a row or a column.
 EVEN = 2
+
+
+class Picture(NamedTuple):
+    """Pixels of a rendered picture, with its colour and its AOVs, and the parts of it that render products have."""
+
+    pixels: NDArray[np.float32]  # (height, width, channels)
+    channels: tuple[str, ...]
+    products: dict[str, list[str]]  # Names of AOVs of products, by their names; "" is the colour
 
 
 class Shutter(NamedTuple):
@@ -109,6 +119,11 @@ _environment = checked(
     lambda given: isfinite(given.turn) and 0 <= given.strength < inf,
     "a picture, such as sky.exr or sky.exr,turn=90,strength=2",
 )
+_aovs = checked(
+    lambda text: {name: AOVS.get(name) for name in text.split(",")},
+    lambda aovs: None not in aovs.values(),
+    f"some of {', '.join(AOVS)}, such as normals,depth",
+)
 _size = checked(_sides, lambda size: min(size) > 0, "width and height of 1 or more, such as 1280x720")
 _frame_range = checked(_numbers, lambda numbers: len(numbers) > 0, "FIRST:LAST or FIRST:LAST:STEP, such as 1:24")
 _share = checked(_one_of_many, lambda share: 1 <= share[0] <= share[1], "I/N with I from 1 to N, such as 2/8")
@@ -155,6 +170,8 @@ def render(parser: CommandParser) -> None:
     add("--transparent", action="store_true", help="with alpha, without a background")
     add("--checker", action="store_true", help="show texture coordinates as a checkerboard")
     add("--cage", action="store_true", help="draw the control cage")
+    text = "channels of the first hits in an OpenEXR file, such as normals,depth, besides those of a stage's products"
+    add("--aov", dest="aovs", type=_aovs, metavar="NAMES", help=text)
     add_cage_options(models, "as many as the picture needs")
     text = "normals: interpolated between vertices, or exact (default: auto, exact where supported)"
     add("--shading", choices=SHADINGS, help=text)
@@ -208,7 +225,7 @@ def _render(options: argparse.Namespace) -> None:
     if options.denoise:
         require_denoiser()
         options.filter = BOX
-    set_variant(options.variant)
+    set_variant(options.variant or _stated_variant(options))
     with _settings(options):
         if options.scene.is_file() and not options.frames:
             require_writable(options.output, [options.scene])
@@ -224,6 +241,26 @@ def _render(options: argparse.Namespace) -> None:
             _write_image(options, image, options.output)
 
 
+def _stated_variant(options: argparse.Namespace) -> str | None:
+    """The variant that render settings of a stage ask for; None if they do not, or it cannot run here."""
+    if not _is_stage(options):
+        return None
+    require_usd(f'"{options.scene}"')
+    from mitsuba_usd.stage_settings import read_variant
+
+    name = read_variant(options.scene, options.over)
+    if name and (problem := variant_problem(name)):
+        warn(f'"{options.scene}": mitsuba:variant of render settings is ignored: {problem}')
+        return None
+    return name
+
+
+def _is_stage(options: argparse.Namespace) -> bool:
+    """Whether a USD file is rendered as a whole."""
+    is_usd = options.scene.suffix.lower().startswith(".usd")
+    return is_usd and not any(getattr(options, name) for name in _OF_ONE_MESH)
+
+
 def _require_effect(options: argparse.Namespace, is_model: bool) -> None:
     """Refuse options that have no effect with this input."""
     what, useless = ("model", _OF_SCENES) if is_model else ("scene", (*_OF_MODELS, *_OF_FRAMES, "save_scene"))
@@ -232,7 +269,7 @@ def _require_effect(options: argparse.Namespace, is_model: bool) -> None:
         given = getattr(options, name)
         # An angle or a sensor may be 0.
         if given is not None and given is not False and given != []:
-            flags = {"parameters": "-D", "share": "--pass", "tolerances": "--tolerance"}
+            flags = {"parameters": "-D", "share": "--pass", "tolerances": "--tolerance", "aovs": "--aov"}
             flag = flags.get(name, f"--{name.replace('_', '-')}")
             raise ValueError(f'{flag} was given for the {what} "{options.scene}"; expected it for {other}')
 
@@ -257,6 +294,8 @@ def _refuse_contradictions(options: argparse.Namespace, by_passes: bool) -> None
         raise ValueError(f"--batch is for passes; expected {all_options} beside it")
     if options.tolerances and not options.reference:
         raise ValueError("--tolerance is stored with a reference; expected --reference beside it")
+    if options.aovs and suffix != ".exr":
+        raise ValueError(f'output "{options.output}" has no AOVs; expected a name ending in .exr')
     if options.transparent and by_passes:
         raise ValueError(f"--transparent is for pictures; expected no {all_options} beside it")
     if options.transparent and suffix not in _WITH_ALPHA:
@@ -300,7 +339,7 @@ def _settings(options: argparse.Namespace) -> Iterator[None]:
             mi.set_log_level(level)
 
 
-def _picture_of_scene(options: argparse.Namespace) -> NDArray[np.float32]:
+def _picture_of_scene(options: argparse.Namespace) -> Picture:
     loaded = load_scene(options.scene, dict(options.parameters), options.filter, options.sensor or 0)
     require_writable(options.output, loaded.file_paths)
     if loaded.scene.integrator() is None:  # Mitsuba would raise a bare Exception.
@@ -332,20 +371,32 @@ def _write_frames(options: argparse.Namespace) -> None:
         print_result(options.output)
 
 
-def _write_image(options: argparse.Namespace, image: NDArray[np.float32], path: Path) -> None:
-    with whole_file(path) as beside:
-        bitmap = _bitmap(image, in_8_bits=path.suffix.lower() in (".png", ".jpg"))
-        if options.denoise:
-            bitmap.metadata()[METADATA_ATTRIBUTE] = json.dumps({"denoised": True})
-        bitmap.write(str(beside))
-    print_result(path)
+def _write_image(options: argparse.Namespace, picture: Picture, path: Path) -> None:
+    """Write a picture, and its products beside it, if they are several, or the picture's format has no AOVs."""
+    colors = [name for name in picture.channels if name in "RGBA"]
+    is_exr = path.suffix.lower() == ".exr"
+    images = {path: [*picture.channels] if is_exr else colors}
+    if len(picture.products) > 1 or (not is_exr and len(colors) < len(picture.channels)):
+        for name, layers in picture.products.items():
+            chosen = [channel for channel in picture.channels if channel.rpartition(".")[0] in layers]
+            images[path.with_name(f"{path.stem}_{name}.exr")] = chosen
+    for file, names in images.items():
+        with whole_file(file) as beside:
+            pixels = picture.pixels[..., [picture.channels.index(name) for name in names]]
+            bitmap = _bitmap(pixels, names, in_8_bits=file.suffix.lower() in (".png", ".jpg"))
+            if options.denoise:
+                bitmap.metadata()[METADATA_ATTRIBUTE] = json.dumps({"denoised": True})
+            bitmap.write(str(beside))
+        print_result(file)
 
 
 def _sub_frames(options: argparse.Namespace) -> int:
     return options.shutter.sub_frames if options.shutter else 1
 
 
-def _bitmap(image: NDArray[np.float32], *, in_8_bits: bool) -> mi.Bitmap:
+def _bitmap(image: NDArray[np.float32], channels: list[str], *, in_8_bits: bool) -> mi.Bitmap:
+    if not in_8_bits and any("." in name for name in channels):
+        return mi.Bitmap(image, mi.Bitmap.PixelFormat.MultiChannel, channels)
     if not in_8_bits or image.shape[2] != 4:
         return mi.util.convert_to_bitmap(image, uint8_srgb=in_8_bits)
     # PNG files have colours that are not multiplied by alpha.
@@ -354,9 +405,9 @@ def _bitmap(image: NDArray[np.float32], *, in_8_bits: bool) -> mi.Bitmap:
 
 
 def _render_picture(
-    options: argparse.Namespace, scenes: Iterable[LoadedScene], spp: int | None = None
-) -> NDArray[np.float32]:
-    """Render a scene, or the mean of the scenes of a frame's sub-frames, which share no samples."""
+    options: argparse.Namespace, scenes: Iterable[LoadedScene], spp: int | None = None, source: Any = None
+) -> Picture:
+    """Render a scene of a source, or the mean of the scenes of a frame's sub-frames, which share no samples."""
     count = _sub_frames(options)
     total: Any = 0.0
     for part, loaded in enumerate(scenes):
@@ -368,18 +419,25 @@ def _render_picture(
                 # Each by itself, as its albedo and normals are those of its time.
                 image = denoised(loaded, image, seed)
         total = total + image / count
-    return total
+    channels = loaded.channel_names(total.shape[2])
+    if source is None:
+        return Picture(total, channels, {})
+    # Small models are rendered as larger ones.
+    lengths = [name for name, kind in source.aovs.items() if kind in LENGTHS]
+    total[..., [channel.rpartition(".")[0] in lengths for channel in channels]] /= source.factor or 1.0
+    return Picture(total, channels, source.products)
 
 
-def _pictures(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float32]]]:
+def _pictures(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
     """Frames of a model, or its picture as number 1, with their numbers, as they are finished."""
     if options.dask:
         return _on_cluster(options, numbers)
-    shown = _shown(options)
+    shown, source = _shown(options)
     if options.save_scene:
         save_scene(shown.scene, options.save_scene, [options.scene])
     scenes = shown.frames(numbers, options.filter)
-    return ((number, _render_picture(options, islice(scenes, _sub_frames(options)))) for number in numbers)
+    count = _sub_frames(options)
+    return ((number, _render_picture(options, islice(scenes, count), source=source)) for number in numbers)
 
 
 def _render_by_passes(options: argparse.Namespace, is_model: bool) -> None:
@@ -429,10 +487,10 @@ def _as_data(options: argparse.Namespace) -> dict[str, Any]:
 def _load_still(given: dict[str, Any]) -> LoadedScene:
     """The scene of a model's picture, by options `_as_data`."""
     options = argparse.Namespace(**given)
-    return next(_shown(options).frames([1], options.filter))
+    return next(_shown(options)[0].frames([1], options.filter))
 
 
-def _on_cluster(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float32]]]:
+def _on_cluster(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
     from .cluster import cluster, results
 
     # The command's own number: files may change until the next one.
@@ -447,24 +505,24 @@ def _on_cluster(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator
             yield number, image
 
 
-def _frame(command: bytes, number: int) -> tuple[NDArray[np.float32], list[str]]:
+def _frame(command: bytes, number: int) -> tuple[Picture, list[str]]:
     """A picture, and the messages of warnings; runs on a worker."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CageWarning)
-        options, shown = _kept(command)
-        image = _render_picture(options, shown.frames([number], options.filter))
+        options, (shown, source) = _kept(command)
+        image = _render_picture(options, shown.frames([number], options.filter), source=source)
     return image, [str(warning.message) for warning in caught if issubclass(warning.category, CageWarning)]
 
 
 @lru_cache(maxsize=1)
-def _kept(command: bytes) -> tuple[argparse.Namespace, FrameRange | Turntable | StillPicture]:
+def _kept(command: bytes) -> tuple[argparse.Namespace, tuple[FrameRange | Turntable | StillPicture, Any]]:
     """Options and what they show: a worker reads it once for all of its frames."""
     options = argparse.Namespace(**pickle.loads(command))
     return options, _shown(options)
 
 
-def _shown(options: argparse.Namespace) -> FrameRange | Turntable | StillPicture:
-    """What a model's pictures show."""
+def _shown(options: argparse.Namespace) -> tuple[FrameRange | Turntable | StillPicture, Any]:
+    """What a model's pictures show, and the scene source."""
     source = _source(options)
     shown: FrameRange | Turntable | StillPicture
     if options.frames or options.shutter:
@@ -480,7 +538,7 @@ def _shown(options: argparse.Namespace) -> FrameRange | Turntable | StillPicture
         print_remark(remark)
     if options.save_scene and source.factor != 1:
         print_remark(f"{source.name}: lengths of the saved scene are {source.factor:g} times those of the small model")
-    return shown
+    return shown, source
 
 
 def _source(options: argparse.Namespace) -> Any:
@@ -492,11 +550,10 @@ def _source(options: argparse.Namespace) -> Any:
         view=(azimuth, elevation),
         has_studio=not options.no_studio,
         scales=True,
-        **{name: value for name in _OF_LOOK if (value := getattr(options, name)) is not None},
+        **{"aovs": {}, **{name: value for name in _OF_LOOK if (value := getattr(options, name)) is not None}},
     )
     which = {"time": options.time, "numbers": options.frames}
-    is_usd = options.scene.suffix.lower().startswith(".usd")
-    if is_usd and not any(getattr(options, name) for name in _OF_ONE_MESH):
+    if _is_stage(options):
         from mitsuba_usd import StageScenes
 
         given = {"tessellation_rate": options.rate, "shading": options.shading}

@@ -16,6 +16,7 @@ from .picture import (
     weigh_lights,
 )
 from .studio_entries import (
+    AOVS,
     DEFAULT_SIZE,
     DEFAULT_SPP,
     DEFAULT_VIEW,
@@ -31,6 +32,7 @@ from .studio_entries import (
 )
 
 __all__ = [
+    "AOVS",
     "DEFAULT_SIZE",
     "DEFAULT_SPP",
     "DEFAULT_VIEW",

@@ -188,6 +188,8 @@ class CageScenes:
         if isinstance(cage, ControlCage) and (prim is not None or time is not None):
             raise CageError(f"{self.name}: prim or time was given; expected them for a file")
         self._cage, self._look = cage, look
+        # As all sources have them: types of AOVs, and the AOVs of render products.
+        self.aovs, self.products = look.aovs or {}, dict[str, list[str]]()
         self._prim, self._time, self._scheme = prim, time, scheme
         self._rules = {"scheme": scheme} if scheme else {}
         self._files = None if numbers is None else FrameFiles(Path(str(cage)), numbers)

@@ -39,8 +39,8 @@ _ORTHOGONAL = 1e-6
 
 
 def save_scene(
-    # As for `mi.load_dict`; a polygon mesh may have the type "ply" and, as `mesh`, an object with a method `save`
-    # that takes a path
+    # As for `mi.load_dict`; a shape of a file may have, as `mesh`, an object with the suffix of the file and a method
+    # `save` that takes a path
     scene: SceneNode,
     path: Path,
     inputs: Iterable[Path] = (),  # Files that must not be written to, besides those that the scene names
@@ -145,7 +145,7 @@ class _SceneParts:
         if "positions" in node:
             entry = self._with_cage(name, node)
         elif "mesh" in node:
-            entry = _with_name(self._file(name, ".ply", entry.pop("mesh").save), entry)
+            entry = _with_name(self._file(name, entry["mesh"].suffix, entry.pop("mesh").save), entry)
         elif "bitmap" in node:
             entry = _with_name(self._picture(name, entry.pop("bitmap"), bool(entry.get("raw"))), entry)
         if "filename" in entry:

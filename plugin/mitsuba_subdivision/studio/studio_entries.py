@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -59,6 +59,12 @@ ENVIRONMENT = "environment"
 RIG = (*LIGHTS, "ground", ENVIRONMENT)
 AMBIENT = (0.17, 0.175, 0.185)
 BACKDROP_COLOUR = (0.30, 0.305, 0.315)
+# Types of Mitsuba's integrator `aov`, by their own names and by those of Hydra and of other renderers.
+AOVS = {name: name for name in ("albedo", "depth", "position", "uv", "geo_normal", "sh_normal", "dp_du", "dp_dv")}
+AOVS |= {name: name for name in ("duv_dx", "duv_dy", "prim_index", "shape_index")}
+AOVS |= {"normal": "sh_normal", "normals": "sh_normal", "N": "sh_normal", "Ng": "geo_normal", "P": "position"}
+AOVS |= {"z": "depth", "st": "uv", "primId": "shape_index", "instanceId": "shape_index", "elementId": "prim_index"}
+LENGTHS = ("depth", "position", "dp_du", "dp_dv")
 # Distances behind the model's middle, in radii, at which the backdrop begins to bend and its wall stands.
 BEND, WALL = 1.6, 7.0
 # Distance of the floor below the model, in radii: a flat model must not coincide with the floor.
@@ -81,7 +87,7 @@ class Look:
     # (width, height) or None: of the film, in pixels. None for 640 by 480, or what a stage's render settings or its
     # camera ask for.
     size: tuple[int, int] | None = None
-    spp: int = DEFAULT_SPP  # Samples per pixel
+    spp: int | None = None  # Samples per pixel; None for 64, or what a stage's render settings ask for
     up: str | None = None  # Axis of a cage that points up; None for that of its file
     rate: int | None = None  # Segments on each edge of a cage; None for as many as a picture needs
     shading: str = "vertex"  # Of a cage
@@ -93,6 +99,8 @@ class Look:
     has_studio: bool = True  # Whether lights and backdrop of the studio are added where they are missing
     scales: bool = False  # Whether a scene is made larger by `enlargement`
     environment: Environment | None = None  # In place of all lights and the backdrop
+    # Types of Mitsuba's AOVs by the names of their channels, besides those of a stage; None for no channels at all
+    aovs: Mapping[str, str] | None = None
 
 
 def enlargement(size: float) -> float:
@@ -107,7 +115,7 @@ def studio(
     # As for `studio_scene`
     view: View = DEFAULT_VIEW,
     size: tuple[int, int] = DEFAULT_SIZE,
-    spp: int = DEFAULT_SPP,
+    spp: int | None = DEFAULT_SPP,
     # (n, 3): of the model in the world, within the bounds. The camera frames these; by default, the box.
     points: ArrayLike | None = None,
     name: str | None = None,  # Of the model, or of its file, with which messages begin
@@ -125,6 +133,7 @@ def studio(
     box = _checked_bounds(bounds, prefix)
     if len(size) != 2 or not all(isinstance(side, numbers.Integral) and 1 <= side <= LARGEST_SIDE for side in size):
         raise ValueError(f"size {size!r}; expected width and height, 1 to {LARGEST_SIDE} pixels")
+    spp = DEFAULT_SPP if spp is None else spp
     if not isinstance(spp, numbers.Integral) or spp < 1:
         raise ValueError(f"spp {spp!r}; expected 1 or more samples per pixel")
     azimuth, elevation = angles_of(view)
@@ -176,7 +185,7 @@ def studio(
 
 
 def finished(scene: SceneNode, look: Look, up: str) -> SceneNode:
-    """A scene with the environment of a look, without a studio or without its background, as the look says."""
+    """A scene with the environment and the AOVs of a look, without a studio or its background, as the look says."""
     left: tuple[str, ...] = ("ground",) if look.transparent else ()
     if look.environment is not None or not look.has_studio:
         left = STUDIO
@@ -186,7 +195,9 @@ def finished(scene: SceneNode, look: Look, up: str) -> SceneNode:
         to_world, name = _transform(matrix, np.zeros(3)), str(look.environment.path.resolve())
         picture = {"filename": name, "scale": look.environment.strength, "to_world": to_world}
         scene[ENVIRONMENT] = {"type": "envmap", **picture}
-    return _without_background(scene) if look.transparent else scene
+    scene = _without_background(scene) if look.transparent else scene
+    aovs = ",".join(f"{name}:{kind}" for name, kind in (look.aovs or {}).items())
+    return {**scene, "integrator": {"type": "aov", "aovs": aovs, "image": scene["integrator"]}} if aovs else scene
 
 
 def _without_background(scene: SceneNode) -> SceneNode:
