@@ -40,6 +40,12 @@ def bsdf(shape: ShapeContents, textures: Textures, notes: StageWarnings) -> Scen
     return _Surface(shape, textures, notes).bsdf()
 
 
+def heights(shape: ShapeContents, textures: Textures, notes: StageWarnings) -> tuple[SceneNode | float, float]:
+    """Heights of a displaced shape, as a texture, a ``mesh_attribute`` or a number, and their scale."""
+    surface, inputs = _Surface(shape, textures, notes), shape.material.inputs if shape.material else {}
+    return surface.number(inputs["displacement"]), _first(inputs.get("displacement_scale", 1.0))
+
+
 def radiance(material: MaterialContents, textures: Textures, notes: StageWarnings) -> SceneNode | None:
     """What a surface emits, as a texture or a spectrum; None if it is black."""
     emission = material.inputs.get("emission", 0.0)
@@ -122,7 +128,7 @@ class _Surface:
             self._notes.add("colours that are not from 0 to 1 are clipped", self._shape.name)
         return rgb(np.clip(value, 0, 1))
 
-    def _number(self, given: Input) -> SceneNode | float:
+    def number(self, given: Input) -> SceneNode | float:
         value = self._for_shape(given)
         if isinstance(value, PrimvarContents):
             return _attribute(value)
@@ -146,7 +152,7 @@ class _Surface:
         """The BSDF, with its normal map and its holes."""
         if self._material is None:
             color = self._color(PrimvarContents("displayColor", GREY))
-            opacity = self._number(PrimvarContents("displayOpacity", [1.0]))
+            opacity = self.number(PrimvarContents("displayOpacity", [1.0]))
             return _masked(_both_sides({"type": "diffuse", "reflectance": color}), opacity)
         weight = self._inputs["transmission"]
         if not self._is("transmission", 0):
@@ -159,11 +165,11 @@ class _Surface:
         else:
             entry = {
                 "type": "blendbsdf",
-                "weight": self._number(weight),
+                "weight": self.number(weight),
                 "bsdf_0": self._opaque(),
                 "bsdf_1": self._turned(self._glass(), is_diffuse=False),
             }
-        return _masked(entry, self._number(self._inputs["opacity"]))
+        return _masked(entry, self.number(self._inputs["opacity"]))
 
     def _turned(self, bsdf: SceneNode, *, is_diffuse: bool = True) -> SceneNode:
         """A BSDF with the normal map, if there is one.
@@ -200,9 +206,9 @@ class _Surface:
         entry: SceneNode = {
             "type": "principled",
             "base_color": self._color(inputs["base_color"]),
-            "roughness": self._number(inputs["roughness"]),
+            "roughness": self.number(inputs["roughness"]),
             "eta": max(self._eta(), _LEAST_ETA),
-            "metallic": self._number(inputs["metalness"]),
+            "metallic": self.number(inputs["metalness"]),
         }
         if not (self._is("metalness", 0) or has_white_edges(inputs["base_color"], inputs["edge_color"])):
             self._leave("edge colours of metals with textures, coats or other layers are ignored; the edges are white")
@@ -210,15 +216,15 @@ class _Surface:
         if ratio is not None:
             # The ratio of its widths is 1 - 0.9 anisotropic.
             rest = node("invert", "float", in_=ratio, amount=1.0)
-            entry["anisotropic"] = self._number(number("divide", rest, 0.9))
+            entry["anisotropic"] = self.number(number("divide", rest, 0.9))
         if not self._is("coat", 0):
             factor = self._reflectance("coat_ior") / _COAT
-            entry["clearcoat"] = self._number(number("multiply", inputs["coat"], factor))
+            entry["clearcoat"] = self.number(number("multiply", inputs["coat"], factor))
             entry["clearcoat_gloss"] = self._gloss()
         if not self._is("sheen", 0):
             color = np.broadcast_to(self._mean("sheen_color"), (3,))
             brightness = float(color @ LUMINANCE)
-            entry["sheen"] = self._number(number("multiply", inputs["sheen"], brightness))
+            entry["sheen"] = self.number(number("multiply", inputs["sheen"], brightness))
             if np.ptp(color) > 0:
                 self._leave("colours of sheen only set its brightness; it is white")
         return entry
@@ -230,7 +236,7 @@ class _Surface:
             self._leave(f"coats rougher than {_DULL**0.5:.2f} are rendered with that roughness")
         width = number("multiply", roughness, roughness)
         gloss = node("divide", "float", in1=node("invert", "float", in_=width, amount=_DULL), in2=_DULL - _GLOSSY)
-        return self._number(node("clamp", "float", in_=gloss, low=0.0, high=1.0))
+        return self.number(node("clamp", "float", in_=gloss, low=0.0, high=1.0))
 
     def _metal(self) -> SceneNode:
         n, k = conductor(constant(self._inputs["base_color"], 3), self._mean("edge_color"))
@@ -267,12 +273,12 @@ class _Surface:
         entry: SceneNode = {
             "type": "principledthin",
             "base_color": self._color(inputs["transmission_color" if transmission == 1 else "base_color"]),
-            "roughness": self._number(inputs["roughness"]),
+            "roughness": self.number(inputs["roughness"]),
             "eta": self._eta(),
             "spec_trans": transmission,
         }
         if transmission < 1:
-            entry["diff_trans"] = self._number(number("multiply", inputs["translucency"], 2.0))
+            entry["diff_trans"] = self.number(number("multiply", inputs["translucency"], 2.0))
         return entry
 
     def _reflectance(self, name: str) -> float:
@@ -313,10 +319,10 @@ class _Surface:
         width = number("max", width, _MIRROR)
         ratio = self._ratio()
         if ratio is None:
-            return {"alpha": self._number(width)}
+            return {"alpha": self.number(width)}
         root = number("power", ratio, 0.5)
         u, v = (number("min", number(category, width, root), 1.0) for category in ("divide", "multiply"))
-        return {"alpha_u": self._number(u), "alpha_v": self._number(v)}
+        return {"alpha_u": self.number(u), "alpha_v": self.number(v)}
 
 
 def _clamped(given: Input) -> Input:

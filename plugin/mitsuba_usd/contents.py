@@ -127,6 +127,11 @@ class ShapeContents:
     # meshes and of large surfaces have the other faces as holes.
     shown_faces: NDArray | None = None
 
+    @property
+    def is_displaced(self) -> bool:
+        """Whether it is a limit surface whose material displaces it."""
+        return self.cage.scheme is not None and self.material is not None and "displacement" in self.material.inputs
+
 
 @dataclass(frozen=True, eq=False)
 class InstanceContents:

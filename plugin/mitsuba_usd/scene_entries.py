@@ -83,6 +83,8 @@ def scene_entries(
 
         def entry(with_bsdf: SceneNode) -> SceneNode:
             if shape.cage.scheme is None:
+                if material is not None and "displacement" in material.inputs:
+                    notes.add("displacement of meshes that are not subdivided is ignored", shape.name)
                 return {**polygon_mesh(shape).entry(with_bsdf, area), **interior(material)}
             return subdivision(shape, surfaces, with_bsdf, area, {**of_shape, **interior(material)}, notes)
 

@@ -38,8 +38,10 @@ def _texcoords(name: str) -> NodeContents:
 
 
 _PREVIEW_SURFACE = "UsdPreviewSurface"
+# Renderers whose outputs of a material are read, the preferred first; "" for any renderer.
+_CONTEXTS = ("mitsuba", "mtlx", "")
 _PREVIEW_PORTS = [_Port(name, "string" if name == "opacityMode" else "", value) for name, value in PREVIEW.items()]
-_PREVIEW_PORTS += [_Port(name, "") for name in ("normal", "occlusion", *LEFT_OUT[_PREVIEW_SURFACE])]
+_PREVIEW_PORTS += [_Port("normal", ""), _Port("occlusion", ""), _Port("displacement", "", 0.0)]
 _TEXTURE_PORTS = [
     _Port("file", "asset"), _Port("st", "texcoord", _texcoords("st")), _Port("sourceColorSpace", "string", "auto"),
     _Port("wrapS", "string", "useMetadata"), _Port("wrapT", "string", "useMetadata"),
@@ -128,7 +130,32 @@ class MaterialReader:
             self._notes.add(f"inputs of {model} that Mitsuba's BSDFs lack are ignored", f"{', '.join(names)} of {path}")
         if any(inputs.get(name, 0.0) != 0 for name in ("subsurface", "subsurface_weight")):
             self._notes.add("subsurface scattering is rendered as diffuse reflection of its colour", path)
-        return surface_models.material(str(path), model, inputs)
+        contents, heights = surface_models.material(str(path), model, inputs), self._displacement(material)
+        if not heights and not is_all(inputs.get("displacement", 0.0), 0):
+            what = f"displacement of {model} is ignored where the material has no connected outputs:displacement"
+            self._notes.add(what, path)
+        return replace(contents, inputs={**contents.inputs, **heights})
+
+    def _displacement(self, material: UsdShade.Material) -> dict[str, Input]:
+        """Heights along the normal, and their scale, where a material has a displacement."""
+        outputs = {context: material.GetDisplacementOutput(context) for context in _CONTEXTS}
+        context = next((name for name, output in outputs.items() if output and output.HasConnectedSource()), "")
+        shader, output, _ = material.ComputeDisplacementSource(context)
+        if not shader:
+            return {}
+        scale: Input | None = 1.0
+        if shader.GetShaderId() == _PREVIEW_SURFACE:
+            heights = self._input(shader, _Port("displacement", "", 0.0))
+        elif shader.GetShaderId() == "ND_displacement_float":
+            heights, scale = (
+                self._input(shader, _Port(n, "float", d)) for n, d in (("displacement", 0.0), ("scale", 1.0))
+            )
+        else:
+            heights = self._output(shader, output)
+        heights, scale = 0.0 if heights is None else heights, 1.0 if scale is None else scale
+        if not isinstance(heights, PrimvarContents):
+            return {"displacement": surface_models.number("multiply", heights, scale)}
+        return {"displacement": heights, "displacement_scale": constant(scale).tolist()[0]}
 
     def _surface(self, shader: UsdShade.Shader) -> tuple[str, dict[str, Input]] | None:
         """Model of a surface, and its inputs but the vectors of the surface itself; None if it is of no known model."""

@@ -22,7 +22,7 @@ COSINE_82 = 1 / 7
 # Difference of reflectances that nobody sees at an edge.
 _VISIBLE = 0.05
 
-# What a surface has, and the value of what it does not say. Widths of GGX lobes are the square of roughness.
+# Material inputs and their defaults. Widths of GGX lobes are the square of roughness.
 NEUTRAL: dict[str, Input] = {
     "base_color": [0.18, 0.18, 0.18],  # Of diffuse reflection, and of metal seen head-on.
     "metalness": 0.0,
@@ -46,6 +46,8 @@ NEUTRAL: dict[str, Input] = {
     "sheen_color": WHITE,
     "emission": BLACK,
     "opacity": 1.0,  # Presence: 0 is a hole.
+    "displacement": 0.0,  # Heights along the normal, in the units of the mesh.
+    "displacement_scale": 1.0,
 }
 
 
@@ -312,7 +314,7 @@ LEFT_OUT: dict[str, tuple[str, ...]] = {
         "base_diffuse_roughness", "transmission_scatter", "transmission_scatter_anisotropy",
         "transmission_dispersion_scale", "coat_roughness_anisotropy", "thin_film_weight",
     ),
-    "UsdPreviewSurface": ("displacement",),
+    "UsdPreviewSurface": (),
     "gltf_pbr": ("iridescence", "dispersion"),
 }  # fmt: skip
 # What inputs of UsdPreviewSurface are where they are not authored.

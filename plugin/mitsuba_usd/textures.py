@@ -52,7 +52,7 @@ class Textures:
 
     def read(self, uses: Iterable[TextureContents]) -> None:
         """Read the pictures of textures on all processors."""
-        keys = list(dict.fromkeys((use.file, use.color_space) for use in uses))
+        keys = [key for key in dict.fromkeys((use.file, use.color_space) for use in uses) if key not in self._pictures]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             for key, picture in zip(keys, pool.map(self._read, keys), strict=True):
                 self._keep(key, picture)

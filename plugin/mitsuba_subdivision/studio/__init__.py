@@ -4,6 +4,7 @@ from ..regression.scene import LoadedScene
 from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
 from .cage_scenes import frame_table, studio_scene
 from .picture import (
+    ERRORS,
     MOST_SEGMENTS,
     MOST_TRIANGLES,
     highest_rate,
@@ -35,6 +36,7 @@ __all__ = [
     "DEFAULT_SPP",
     "DEFAULT_VIEW",
     "ENVIRONMENT",
+    "ERRORS",
     "MOST_SEGMENTS",
     "MOST_TRIANGLES",
     "STUDIO",
