@@ -54,6 +54,10 @@ class NodeContents:
     inputs: dict[str, Input]
 
 
+class MaterialError(ValueError):
+    """A material that cannot be read, with the reason."""
+
+
 Part = TypeVar("Part", "ShapeContents", "LightContents")
 Source = TextureContents | PrimvarContents | NodeContents
 # A number or a colour, or where it comes from.

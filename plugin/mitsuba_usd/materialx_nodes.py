@@ -17,7 +17,7 @@ import numpy as np
 from mitsuba_subdivision.cage import same
 from numpy.typing import NDArray
 
-from .contents import Input, NodeContents, PrimvarContents, TextureContents
+from .contents import Input, MaterialError, NodeContents, PrimvarContents, TextureContents, parts
 
 Values = NDArray[np.floating]
 Hash = NDArray[np.uint32]
@@ -83,8 +83,11 @@ def operation(category: str, kind: str, inputs: Mapping[str, Any]) -> Values:
     """What a category computes of values; ``kind`` is the type of its output."""
     named = {"in_" if name == "in" else name: value for name, value in inputs.items()}
     arguments = SimpleNamespace(**{**named, "kind": kind, "width": CHANNELS[kind]})
-    with np.errstate(all="ignore"):
-        values = np.asarray(OPERATIONS[category](arguments))
+    try:
+        with np.errstate(all="ignore"):
+            values = np.asarray(OPERATIONS[category](arguments))
+    except (IndexError, ValueError):
+        raise MaterialError(f"{category} of {', '.join(inputs)} of other types") from None
     # As shaders do, which have no way to say that there is no number.
     return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
 
@@ -336,8 +339,33 @@ OPERATIONS: dict[str, Callable[[SimpleNamespace], Values]] = {
     "worleynoise2d": _worley,
     "roughness_anisotropy": _roughness,
 }
+# Sets of inputs in which an operation is affine while its other inputs are constant.
+AFFINE: dict[str, tuple[set[str], ...]] = {
+    **dict.fromkeys(("add", "subtract", "combine2"), ({"in1", "in2"},)),
+    **dict.fromkeys(("combine3", "combine4"), ({"in1", "in2", "in3", "in4"},)),
+    **dict.fromkeys(("extract", "convert", "rotate2d", "rotate3d", "dot"), ({"in"},)),
+    **dict.fromkeys(("mix", "plus", "minus"), ({"bg", "fg"}, {"mix"})),
+    **dict.fromkeys(("screen", "over"), ({"fg"}, {"bg"}, {"mix"})),
+    **dict.fromkeys(("in", "mask", "out"), ({"fg"}, {"bg"}, {"mix"})),
+    **dict.fromkeys(("inside", "outside"), ({"in"}, {"mask"})),
+    "multiply": ({"in1"}, {"in2"}),
+    "divide": ({"in1"},),
+    "dotproduct": ({"in1"}, {"in2"}),
+    "crossproduct": ({"in1"}, {"in2"}),
+    "invert": ({"in", "amount"},),
+    "remap": ({"in"}, {"outlow", "outhigh"}),
+    "ifgreater": ({"in1", "in2"},),
+    "ifgreatereq": ({"in1", "in2"},),
+    "ifequal": ({"in1", "in2"},),
+    "constant": ({"value"},),
+}
 # That read texture coordinates or pictures themselves.
 SAMPLED = ("texcoord", "image", "heighttonormal")
+
+
+def is_affine(category: str, varying: set[str]) -> bool:
+    """Whether an operation is affine in inputs that vary."""
+    return any(varying <= names for names in AFFINE.get(category, ()))
 
 
 def node(category: str, kind: str, **inputs: Input) -> Input:
@@ -368,10 +396,12 @@ def is_constant(given: Input) -> bool:
 
 
 def constant(given: Input, width: int | None = None) -> NDArray[np.float64]:
-    """Numbers ``(k,)`` of a constant input, maybe repeated to a width. Raises TypeError, ValueError for others."""
-    if not isinstance(given, (int, float, list)):
-        raise TypeError(f"{given!r} is no number; expected one, or a colour")
-    numbers = np.atleast_1d(np.asarray(given, dtype=np.float64))
+    """Numbers ``(k,)`` of a constant input, maybe repeated to a width. Raises MaterialError for others."""
+    numbers = (
+        np.atleast_1d(np.asarray(given, dtype=np.float64)) if isinstance(given, (int, float, list)) else np.zeros(0)
+    )
+    if not numbers.size or (width is not None and numbers.size not in (1, width)):
+        raise MaterialError(f"{given!r} is not {width or 'one'} number{'s' * (width not in (None, 1))}")
     return numbers if width is None else np.broadcast_to(numbers, (width,))
 
 
@@ -409,40 +439,33 @@ def _without_effect(category: str, kind: str, given: dict[str, Input]) -> Input 
 _COMPARED: dict[str, Callable[[float, float], bool]] = {
     "ifgreater": operator.gt, "ifgreatereq": operator.ge, "ifequal": operator.eq,
 }  # fmt: skip
-# Colours by which a node of pictures is tried out: black, the four channels, and others, within 0 to 1 and beyond.
-_random = np.random.default_rng(0)
-_TRIED_COLORS = np.vstack([np.zeros(4), np.eye(4), _random.random((8, 4)), _random.uniform(-20, 20, (8, 4))])
+_VARYING = frozenset({"channel", "scale", "bias", "fallback"})
+# Channels of an image and a constant, by which affine functions are known: black, and each channel alone.
+_BASIS = np.vstack([np.zeros(4), np.eye(4)])
 
 
 def _picture(category: str, kind: str, given: dict[str, Input]) -> TextureContents | None:
-    """The picture that a node of one picture comes to: one each of whose channels is a scaled and moved one of it.
+    """If the node is affine per channel in one image, that image with a new scale and bias; else None.
 
-    None if it is no such node. Channels of the picture may be inputs of their own.
+    Channels of the image may be inputs of their own.
     """
-    pictures = [value for value in given.values() if isinstance(value, TextureContents)]
-    varying = frozenset({"channel", "scale", "bias", "fallback"})
-    if not all(isinstance(value, TextureContents) or is_constant(value) for value in given.values()):
+    pictures = {name: value for name, value in given.items() if isinstance(value, TextureContents)}
+    first = next(iter(pictures.values()), None)
+    if first is None or not all(name in pictures or is_constant(value) for name, value in given.items()):
         return None
-    if not all(same(picture, pictures[0], varying) for picture in pictures):
+    if not is_affine(category, set(pictures)) or not all(same(one, first, _VARYING) for one in pictures.values()):
         return None
 
-    def tried(value: Input) -> Any:
+    def on_basis(value: Input) -> Any:
         if isinstance(value, TextureContents):
-            return np.vstack([_TRIED_COLORS * value.scale + value.bias, value.fallback])[:, value.channels]
+            return np.vstack([_BASIS * value.scale + value.bias, value.fallback])[:, value.channels]
         return value if isinstance(value, str) else constant(value)
 
-    try:
-        values = operation(category, kind, {name: tried(value) for name, value in given.items()})
-    except (IndexError, ValueError):
-        return None
-    if values.ndim != 2 or not values.shape[1]:
-        return None
+    values = operation(category, kind, {name: on_basis(value) for name, value in given.items()})
     bias, slopes, columns = values[0], values[1:5] - values[0], np.arange(values.shape[1])
     channels = np.abs(slopes).argmax(axis=0)
     factor = slopes[channels, columns]
-    expected = _TRIED_COLORS[:, channels] * factor + bias
-    # What is constant for all that is tried may be a step beyond.
-    if not factor.all() or not np.allclose(values[:-1], expected, rtol=1e-9, atol=1e-12):
+    if (np.count_nonzero(slopes, axis=0) != 1).any():
         return None
     if np.ptp(np.vstack([channels, values]), axis=1).max() == 0:
         # One channel serves as a colour.
@@ -450,10 +473,25 @@ def _picture(category: str, kind: str, given: dict[str, Input]) -> TextureConten
     channel = "".join("rgba"[index] for index in channels)
     if channel not in ("r", "g", "b", "a", "rg", "rgb", "rgba"):
         return None
-    numbers = np.array([pictures[0].scale, pictures[0].bias, pictures[0].fallback])
+    numbers = np.array([first.scale, first.bias, first.fallback])
     numbers[:, channels] = np.stack([factor, bias, values[-1]])[:, columns]
     scale, bias, fallback = numbers.tolist()
-    return replace(pictures[0], channel=channel, scale=scale, bias=bias, fallback=fallback)
+    return replace(first, channel=channel, scale=scale, bias=bias, fallback=fallback)
+
+
+def affine_map(given: Input) -> NDArray[np.float64] | None:
+    """Matrix ``(3, 3)`` of an expression of texture coordinates if all its nodes are affine; else None."""
+    for part in parts(given):
+        if not isinstance(part, NodeContents):
+            return None
+        varying = {name for name, value in part.inputs.items() if not is_constant(value)}
+        if part.category != "texcoord" and not is_affine(part.category, varying):
+            return None
+    origin, u, v = np.broadcast_to(evaluate(given, _CORNERS), (3, 2)).astype(np.float64)
+    return np.vstack([np.stack([u - origin, v - origin, origin], axis=1), [0, 0, 1]])
+
+
+_CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 
 
 def _plain(values: Values) -> float | list[float]:

@@ -10,13 +10,12 @@ import numpy as np
 from mitsuba_subdivision.cage import same
 from mitsuba_subdivision.files import value_at
 from mitsuba_subdivision.srgb import decoded
-from numpy.typing import NDArray
 from pxr import Usd, UsdShade
 
 from . import surface_models
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, TextureContents, leaves
 from .materialx_layers import has_materialx, library, numbers
-from .materialx_nodes import CHANNELS, OPERATIONS, SAMPLED, constant, evaluate, is_all, is_constant, node, node_of
+from .materialx_nodes import CHANNELS, OPERATIONS, SAMPLED, affine_map, constant, is_all, is_constant, node, node_of
 from .stage_warnings import StageWarnings
 from .surface_models import LEFT_OUT, MODELS, PREVIEW
 from .texture_image import UDIM
@@ -67,8 +66,6 @@ _IS_SRGB = {
 }  # fmt: skip
 # Nodes that an expression may have when what several nodes share is counted for each.
 _MOST_NODES = 10_000
-# Where a mapping of texture coordinates is tried out: whether it is affine.
-_TRIED = np.array([[0, 0], [1, 0], [0, 1], [0.37, 0.61], [-2.3, 5.7], [17.1, -3.9], [-8.4, -11.2]])
 
 
 def _path_of(asset: Any, attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
@@ -404,7 +401,7 @@ class MaterialReader:
             return replace(picture, texcoords=where.name)
         where = [0.0, 0.0] if where is None else where
         names = {str(leaf.inputs["name"]) if isinstance(leaf, NodeContents) else None for leaf in leaves(where)}
-        to_uv = None if len(names) > 1 or None in names else _affine_map(where)
+        to_uv = None if len(names) > 1 or None in names else affine_map(where)
         if to_uv is None:
             return NodeContents("image", kind, {"file": picture, "texcoord": where})
         return replace(picture, to_uv=to_uv, texcoords=str(next(iter(names), "st")))
@@ -440,13 +437,3 @@ _SPECIAL: dict[str, Callable[..., Input | None]] = {
     "geompropvalueuniform": MaterialReader._attribute,
     "normalmap": MaterialReader._normal,
 }
-
-
-def _affine_map(where: Input) -> NDArray[np.float64] | None:
-    """Matrix ``(3, 3)`` of an affine function of texture coordinates; None if it is no such function."""
-    points = np.broadcast_to(evaluate(where, _TRIED), _TRIED.shape).astype(np.float64)
-    matrix = np.eye(3)
-    matrix[:2, 2] = points[0]
-    matrix[:2, 0], matrix[:2, 1] = points[1] - points[0], points[2] - points[0]
-    error = np.abs(_TRIED @ matrix[:2, :2].T + matrix[:2, 2] - points).max()
-    return matrix if error <= 1e-4 * max(1.0, np.abs(points).max()) else None

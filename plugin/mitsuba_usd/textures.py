@@ -14,7 +14,7 @@ import numpy as np
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
-from .contents import NodeContents, TextureContents, leaves, parts
+from .contents import MaterialError, NodeContents, TextureContents, leaves, parts
 from .materialx_nodes import Values, evaluate, fallback_of
 from .stage_warnings import StageWarnings
 from .texture_image import TextureImage, is_srgb_image, linear_values, read_texture_image, with_alpha
@@ -97,7 +97,7 @@ class Textures:
         if id(given) not in self._expressions:
             try:
                 values, to_uv, wrap = baked(given, self._source)
-            except (ValueError, IndexError):
+            except MaterialError:
                 what = f'expressions of "{given.category}" with values of other types are ignored; 0.5 is used'
                 files = [source.file for source in leaves(given) if isinstance(source, TextureContents)]
                 self._notes.add(what, ", ".join(files))

@@ -131,3 +131,14 @@ def test_displacement_that_is_ignored_is_told(tmp_path, variant_scalar_rgb):  # 
         path = stages.write(tmp_path, text + mesh("sheet", body, bound()))
         _, messages = told(msub.usd_scene, path, mi)
         assert [message.endswith(expected) for message in messages] == [True], messages
+
+
+def test_the_street_of_the_gallery_has_stones(variant_llvm_ad_rgb):  # noqa: ARG001
+    """As high as its nodes say, at a rate that shows them."""
+    entries, messages = told(msub.usd_scene, msub.example_file("cobbles.usda"), mi, size=(64, 36))
+    street = entries["Scene_Street"]
+    heights = np.array(street["displacement"]["bitmap"])
+    assert not messages
+    assert street["tessellation_rate"] > 8
+    # Between joints and tops, 0.16 times 1 apart, with some grain.
+    assert 0.15 < np.ptp(np.quantile(heights, [0.02, 0.98])) < 0.18
