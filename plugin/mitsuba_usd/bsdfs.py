@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import ArrayLike, NDArray
 
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
-from .materialx_nodes import LUMINANCE, constant, is_all, is_constant, node
+from .materialx_nodes import LUMINANCE, constant, is_all, is_constant, node, width_of
 from .stage_warnings import StageWarnings
 from .surface_models import NEUTRAL, conductor, has_white_edges, number, with_shape
 from .textures import Textures
@@ -28,6 +30,8 @@ _MIRROR = 0.001
 _LEAST_ETA = 1.001
 # Numbers beyond 0 to 1 break Mitsuba's BSDFs.
 _FRACTIONS = ("roughness", "metalness", "transmission", "opacity")
+# Parameters of Mitsuba's own BSDFs that are no colours.
+_RAW = ("normalmap", "bumpmap")
 # Vertices of paths through glass: in and out of a shell twice, with reflections between.
 _DEEPEST = 24
 # Where roulette may end a path. At Mitsuba's own depth of 5, pictures of the same noise take up to 8 % longer: chess
@@ -90,7 +94,8 @@ def integrator(
     Roulette ends paths through glass earlier than by default, as most of the long ones carry little.
     """
     kind = "volpath" if has_clear_lamps or any(map(absorbs, materials)) else usual["type"]
-    if all(material.inputs.get("transmission", 0.0) == 0 for material in materials):
+    # Mitsuba's own BSDFs may be glass.
+    if all(material.inputs.get("transmission", 0.0) == 0 and "bsdf" not in material.inputs for material in materials):
         return {**usual, "type": kind}
     return {**usual, "type": kind, "max_depth": max(usual["max_depth"], _DEEPEST), "rr_depth": _ROULETTE}
 
@@ -101,7 +106,7 @@ class _Surface:
     def __init__(self, shape: ShapeContents, textures: Textures, notes: StageWarnings) -> None:
         self._material, self._shape, self._textures, self._notes = shape.material, shape, textures, notes
         inputs = {} if shape.material is None else shape.material.inputs
-        given = {name: self._for_shape(value) for name, value in inputs.items()}
+        given = {name: self._for_shape(value) for name, value in inputs.items() if name != "bsdf"}
         self._inputs: dict[str, Input] = {**NEUTRAL, **given}
         self._inputs |= {name: _clamped(self._inputs[name]) for name in _FRACTIONS}
 
@@ -128,7 +133,38 @@ class _Surface:
             self._notes.add("colours that are not from 0 to 1 are clipped", self._shape.name)
         return rgb(np.clip(value, 0, 1))
 
+    def _plugin(self, given: Input, name: str = "") -> Any:
+        """A parameter of a plugin of Mitsuba, or a plugin of its own."""
+        if isinstance(given, NodeContents) and given.is_plugin:
+            parameters = {key: self._plugin(value, key) for key, value in given.inputs.items() if key}
+            return {"type": given.category, **parameters}
+        if isinstance(given, list):
+            is_matrix = len(given) == 9
+            return mi.ScalarAffineTransform3f(np.reshape(given, (3, 3)).tolist()) if is_matrix else rgb(given)
+        if isinstance(given, TextureContents) and name in _RAW:
+            return self._textures.color(given, is_raw=True)
+        if isinstance(given, (TextureContents, NodeContents, PrimvarContents)):
+            return self.number(given) if width_of(given) == 1 else self._color(given)
+        return given
+
+    def _loadable(self, entry: SceneNode) -> SceneNode:
+        """A BSDF without the parameters that its plugins lack; grey if Mitsuba cannot load it."""
+        try:
+            if isinstance(mi.load_dict(entry), mi.BSDF):
+                return entry
+            problem = "not a BSDF"
+        except RuntimeError as error:
+            problem = str(error)
+        plugin, unknown = re.search(r'plugin of type "(\w+)"', problem), re.findall(r'\n  - \w+ "(.+?)":', problem)
+        if plugin and unknown:
+            self._leave(f"parameters that Mitsuba's {plugin[1]} does not have are ignored ({', '.join(unknown)})")
+            return self._loadable(_without(entry, plugin[1], unknown))
+        self._leave(f"materials that Mitsuba cannot load are grey ({problem.rpartition('] ')[2].splitlines()[0]})")
+        return _both_sides({"type": "diffuse", "reflectance": rgb(GREY)})
+
     def number(self, given: Input) -> SceneNode | float:
+        if isinstance(given, NodeContents) and given.is_plugin:
+            return dict(self._plugin(given))
         value = self._for_shape(given)
         if isinstance(value, PrimvarContents):
             return _attribute(value)
@@ -154,6 +190,8 @@ class _Surface:
             color = self._color(PrimvarContents("displayColor", GREY))
             opacity = self.number(PrimvarContents("displayOpacity", [1.0]))
             return _masked(_both_sides({"type": "diffuse", "reflectance": color}), opacity)
+        if "bsdf" in self._material.inputs:
+            return self._loadable(self._plugin(self._material.inputs["bsdf"]))
         weight = self._inputs["transmission"]
         if not self._is("transmission", 0):
             opaque = node("invert", "float", in_=self._inputs["metalness"], amount=1.0)
@@ -331,6 +369,12 @@ def _clamped(given: Input) -> Input:
     if is_plain or isinstance(given, PrimvarContents):
         return given
     return node("clamp", "float", in_=given, low=0.0, high=1.0)
+
+
+def _without(entry: SceneNode, plugin: str, names: list[str]) -> SceneNode:
+    """An entry whose nodes of a plugin lack some parameters."""
+    kept = entry if entry["type"] != plugin else {key: value for key, value in entry.items() if key not in names}
+    return {k: _without(v, plugin, names) if isinstance(v, dict) and "type" in v else v for k, v in kept.items()}
 
 
 def _attribute(given: PrimvarContents) -> SceneNode:

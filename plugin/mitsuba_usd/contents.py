@@ -15,6 +15,22 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True, eq=False)
+class NodeContents:
+    """A node of a shading network: what MaterialX computes of its inputs, or a plugin of Mitsuba."""
+
+    category: str  # Such as "multiply", see `materialx_nodes.OPERATIONS`; or the name of a plugin
+    type: str  # Of its output: "float", "color3", "vector2" and so on; "mitsuba" for plugins
+    # All its inputs except geometric ones. A string is an option. The category "texcoord" has the name of a primvar,
+    # and the fallback where a mesh lacks it; without a fallback, others of the mesh serve as well.
+    inputs: dict[str, Input]
+
+    @property
+    def is_plugin(self) -> bool:
+        """Whether it is a plugin of Mitsuba."""
+        return self.type == "mitsuba"
+
+
+@dataclass(frozen=True, eq=False)
 class TextureContents:
     """An image that an input of a material reads, ``scale * image + bias``."""
 
@@ -26,7 +42,7 @@ class TextureContents:
     bias: list[float] = field(default_factory=lambda: [0.0] * 4)
     # (3, 3) float64: from texture coordinates to those of the picture, whose v points up
     to_uv: NDArray = field(default_factory=lambda: np.eye(3))
-    texcoords: str = "st"  # Name of the primvar that has the texture coordinates
+    texcoords: NodeContents = field(default_factory=lambda: NodeContents("texcoord", "vector2", {"name": "st"}))
     fallback: list[float] = field(default_factory=lambda: [0.0] * 4)  # Where there is no such file
 
     @property
@@ -41,17 +57,6 @@ class PrimvarContents:
 
     name: str
     fallback: list[float]
-
-
-@dataclass(frozen=True, eq=False)
-class NodeContents:
-    """A node of a shading network: what MaterialX computes of its inputs."""
-
-    category: str  # Such as "multiply"; see `materialx_nodes.OPERATIONS`
-    type: str  # Of its output: "float", "color3", "vector2" and so on
-    # All that the category has, but for those of the surface itself, such as its normal. A string is an option; that of
-    # the category "texcoord" names the primvar.
-    inputs: dict[str, Input]
 
 
 class MaterialError(ValueError):
@@ -104,13 +109,10 @@ class MaterialContents:
         """Names of the attributes that it reads."""
         return {leaf.name for leaf in self._leaves() if isinstance(leaf, PrimvarContents)}
 
-    def texcoords(self) -> list[str]:
-        """Names of the texture coordinates that it reads, each once."""
-        names: dict[str, None] = {}
-        for leaf in self._leaves():
-            if not isinstance(leaf, PrimvarContents):
-                names[str(leaf.inputs["name"]) if isinstance(leaf, NodeContents) else leaf.texcoords] = None
-        return list(names)
+    def texcoords(self) -> dict[str, Input | None]:
+        """Names of the texture coordinates that it reads, with their fallbacks."""
+        sets = (leaf.texcoords if isinstance(leaf, TextureContents) else leaf for leaf in self._leaves())
+        return {str(s.inputs["name"]): s.inputs.get("fallback") for s in sets if isinstance(s, NodeContents)}
 
     def _leaves(self) -> Iterator[Source]:
         return (leaf for given in self.inputs.values() for leaf in leaves(given))

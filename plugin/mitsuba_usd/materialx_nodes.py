@@ -390,6 +390,15 @@ def node_of(category: str, kind: str, given: dict[str, Input]) -> Input:
     return NodeContents(category, kind, given) if simpler is None else simpler
 
 
+def width_of(given: Input) -> int:
+    """How many numbers an input has."""
+    if isinstance(given, NodeContents):
+        return CHANNELS.get(given.type, 1)
+    if isinstance(given, (TextureContents, PrimvarContents)):
+        return len(given.channels if isinstance(given, TextureContents) else given.fallback)
+    return len(given) if isinstance(given, list) else 1
+
+
 def is_constant(given: Input) -> bool:
     """Whether an input is a number, a colour or an option."""
     return isinstance(given, (int, float, list, str))

@@ -8,13 +8,14 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from mitsuba_subdivision.cage import Attribute, CageContents, CageError, CageSource, require_range, shortened
+from mitsuba_subdivision.cage import Attribute, CageContents, CageError, CageSource, in_digits, require_range, shortened
 from mitsuba_subdivision.files import MeshReader, Skinning, require_types, value_at
 from mitsuba_subdivision.mesh import IntArray
 from numpy.typing import NDArray
 from pxr import Usd, UsdGeom, UsdLux, UsdShade
 
-from .contents import MaterialContents, ShapeContents
+from .contents import Input, MaterialContents, ShapeContents
+from .materialx_nodes import constant
 from .stage_lights_and_camera import read_emission
 from .stage_materials import MaterialReader
 from .stage_warnings import StageWarnings
@@ -67,10 +68,7 @@ class ShapeReader:
             names = self._primvars(material)
             if names not in cages:
                 cages[names] = reader.contents(*names)
-            cage, uv_name = cages[names], names[1]
-            if uv_name is not None and cage.texcoords is not None and not UsdGeom.PrimvarsAPI(prim).HasPrimvar(uv_name):
-                what = f'texture coordinates "{uv_name}" are missing; the first others of the mesh are used'
-                self._notes.add(what, prim.GetPath())
+            cage = cages[names]
             normals = reader.normals(cage) if cage.scheme is None else None
             shown = None
             if len(materials) > 1:
@@ -129,12 +127,8 @@ class ShapeReader:
         normals: NDArray[np.float64] | None,
         material: MaterialContents | None,
     ) -> ShapeContents:
-        if material and material.texcoords() and cage.texcoords is None:
-            # Of those that are there and do not fit, there is a message already.
-            if not UsdGeom.PrimvarsAPI(prim).HasPrimvar(material.texcoords()[0]):
-                what = "prims without texture coordinates have the colour of their texture at (0, 0)"
-                self._notes.add(what, prim.GetPath())
-            cage = replace(cage, texcoords=Attribute(np.zeros((len(cage.positions), 2)), "vertex"))
+        for name, fallback in [] if material is None else [*material.texcoords().items()][:1]:
+            cage = self._with_texcoords(prim, cage, name, fallback)
         names = COLORS if material is None else material.primvars()
         constants = {name: self._constant(prim, name) for name in names if name not in cage.attributes}
         constants = {name: values for name, values in constants.items() if values}
@@ -147,6 +141,20 @@ class ShapeReader:
                 self._notes.add("mesh lights with numbers that are not finite are ignored", prim.GetPath())
                 radiance = None
         return ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, constants, radiance)
+
+    def _with_texcoords(self, prim: Usd.Prim, cage: CageContents, name: str, fallback: Input | None) -> CageContents:
+        """A cage with texture coordinates of a name, or else with others of its own or the fallback."""
+        is_missing = not UsdGeom.PrimvarsAPI(prim).HasPrimvar(name)
+        if cage.texcoords is not None and (fallback is None or not is_missing):
+            if is_missing:
+                what = f'texture coordinates "{name}" are missing; the first others of the mesh are used'
+                self._notes.add(what, prim.GetPath())
+            return cage
+        place = np.zeros(2) if fallback is None else constant(fallback, 2)
+        if is_missing:
+            at = ", ".join(map(in_digits, place.tolist()))
+            self._notes.add(f'texture coordinates "{name}" are missing; textures are read at ({at})', prim.GetPath())
+        return replace(cage, texcoords=Attribute(np.tile(place, (len(cage.positions), 1)), "vertex"))
 
     def _constant(self, prim: Usd.Prim, name: str) -> list[float]:
         """A primvar of a prim, or of those above, that has one value of one or three numbers; else nothing."""

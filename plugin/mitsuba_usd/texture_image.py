@@ -16,6 +16,8 @@ from mitsuba_subdivision.srgb import decoded, encoded
 from numpy.typing import NDArray
 
 UDIM = "<UDIM>"
+# From the texture coordinates of USD, whose v points up, to those of Mitsuba's bitmaps, and back.
+V_DOWN = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
 # A file within an archive: archive.usdz[folder/file.png].
 _IN_ARCHIVE = re.compile(r"(.*\.usdz)\[(.*)\]$")
 _JPEG = b"\xff\xd8"

@@ -17,10 +17,8 @@ from numpy.typing import NDArray
 from .contents import MaterialError, NodeContents, TextureContents, leaves, parts
 from .materialx_nodes import Values, evaluate, fallback_of
 from .stage_warnings import StageWarnings
-from .texture_image import TextureImage, is_srgb_image, linear_values, read_texture_image, with_alpha
+from .texture_image import V_DOWN, TextureImage, is_srgb_image, linear_values, read_texture_image, with_alpha
 
-# From the texture coordinates of USD, whose v points up, to those of Mitsuba's bitmaps.
-_V_DOWN = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
 # Pixels along the unit square of what has no picture, and of what has large ones, many times.
 LEAST_PROCEDURAL, MOST = 1024, 4096
 _PIXELS_AT_ONCE = 1 << 20
@@ -57,15 +55,19 @@ class Textures:
             for key, picture in zip(keys, pool.map(self._read, keys), strict=True):
                 self._keep(key, picture)
 
-    def color(self, given: TextureContents | NodeContents, *, is_radiance: bool = False) -> SceneNode:
+    def color(
+        self, given: TextureContents | NodeContents, *, is_radiance: bool = False, is_raw: bool = False
+    ) -> SceneNode:
         """A texture of colours, up to 1 unless of radiance, or the fallback of a picture that cannot be read."""
+        if isinstance(given, TextureContents) and is_raw and given.color_space == "auto":
+            given = replace(given, color_space="raw")
         use, picture = self._used(given)
         most = None if is_radiance else 1.0
         if picture is None:
             return {"type": "rgb", "value": np.clip(np.broadcast_to(_fallback(use), (3,)), 0, most).tolist()}
         if isinstance(given, NodeContents):
             picture = replace(picture, pixels=np.clip(picture.pixels, 0, most))
-        return self._bitmap(use, picture, is_raw=use.channel != "rgb")
+        return self._bitmap(use, picture, is_raw=is_raw or use.channel != "rgb")
 
     def number(self, given: TextureContents | NodeContents) -> SceneNode | float:
         """A texture of numbers, or the fallback of a picture that cannot be read."""
@@ -79,6 +81,11 @@ class Textures:
         use, picture = self._used(given)
         if picture is None:
             return None
+        if picture.pixels.dtype == np.uint8 and use.scale[:2] == [1.0, 1.0] and use.bias[:2] == [0.0, 0.0]:
+            what = (
+                "normal maps of eight bits are normals from 0 to 1 as they are; expected a scale of 2 and a bias of -1"
+            )
+            self._notes.add(what, use.file)
         scale, bias, fallback = (np.array([use.scale, use.bias, use.fallback]) + np.array([[0], [1], [1]])) / 2
         use = replace(use, scale=scale.tolist(), bias=bias.tolist(), fallback=fallback.tolist())
         return self._bitmap(use, picture, is_raw=True)
@@ -134,7 +141,7 @@ class Textures:
                 self._bitmaps[key] = mi.Bitmap(np.ascontiguousarray(_selected(pixels, channels)))
                 self._bitmaps[key].set_srgb_gamma(is_decoded)
             bitmap = self._bitmaps[key]
-        to_uv = mi.ScalarAffineTransform3f((_V_DOWN @ picture.to_uv @ texture.to_uv).tolist())
+        to_uv = mi.ScalarAffineTransform3f((V_DOWN @ picture.to_uv @ texture.to_uv).tolist())
         return {"type": "bitmap", "bitmap": bitmap, "raw": is_raw, "wrap_mode": texture.wrap, "to_uv": to_uv}
 
     def _picture(self, path: str, color_space: str | None = None) -> TextureImage | None:
