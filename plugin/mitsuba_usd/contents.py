@@ -129,6 +129,7 @@ class ShapeContents:
     material: MaterialContents | None = None  # Those that are equal are one
     constants: dict[str, list[float]] = field(default_factory=dict)  # Attributes with one value for the whole mesh
     radiance: list[float] | None = None  # Three numbers, if the mesh is a light
+    is_normalized: bool = False  # Whether the radiance is that of the whole light, to be divided by its area
     # (n,) int: faces with this material, of a limit surface that is evaluated whole; None for all. Parts of polygon
     # meshes and of large surfaces have the other faces as holes.
     shown_faces: NDArray | None = None

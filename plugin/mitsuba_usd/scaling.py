@@ -38,7 +38,10 @@ def scaled(contents: SceneContents, factor: float) -> SceneContents:
         return materials.get(material, material)
 
     def of_shape(shape: ShapeContents, matrix: np.ndarray) -> ShapeContents:
-        return replace(shape, to_world=matrix @ shape.to_world, material=of_material(shape.material))
+        grown = replace(shape, to_world=matrix @ shape.to_world, material=of_material(shape.material))
+        if shape.radiance is None or not shape.is_normalized:
+            return grown
+        return replace(grown, radiance=(np.array(shape.radiance) * factor**2).tolist())
 
     def of_light(light: LightContents) -> LightContents:
         # What is given for a whole lamp is divided by its area, or by the square of the distance.

@@ -99,15 +99,15 @@ def scene_entries(
 
     def shown(shape: ShapeContents) -> SceneNode | mi.Object | None:
         """A shape; None if it cannot be used, with a warning."""
-        shining = None if shape.radiance is None else rgb(shape.radiance)
-        if shining is None and shape.material is not None:
-            shining = radiance(shape.material, textures, notes)
-        area = None if shining is None else {"type": "area", "radiance": shining}
         try:
+            shining = None if shape.radiance is None else rgb(np.array(shape.radiance) / _light_area(shape))
+            if shining is None and shape.material is not None:
+                shining = radiance(shape.material, textures, notes)
+            area = None if shining is None else {"type": "area", "radiance": shining}
             return made(shape, area)
         except SchemeError as error:
             notes.add_message(f"{error}; the mesh is shown as polygons", shape.name)
-            return made(as_polygons(shape), area)
+            return shown(as_polygons(shape))
         except CageError as error:
             notes.add_message(f"{error}; the prim is left out", shape.name)
             return None
@@ -241,6 +241,18 @@ def subdivision(
         "bsdf": bsdf,
         **({} if emitter is None else {"emitter": emitter}),
     }
+
+
+def _light_area(shape: ShapeContents) -> float:
+    """Area of a normalized light in the world, with all its faces; 1 for others."""
+    if not shape.is_normalized:
+        return 1.0
+    cage = replace(shape.cage, positions=points_at(np.asarray(shape.cage.positions, np.float64), shape.to_world))
+    if cage.scheme is not None:
+        return LimitSurface(ControlCage.from_arrays(**cage.as_arguments())).area()
+    corners, face = triangle_corners(cage.positions, cage.face_sizes, cage.face_vertices)
+    p = cage.positions[cage.face_vertices[corners[~np.isin(face, cage.holes)]]]
+    return float(np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1).sum() / 2) or 1.0
 
 
 def as_polygons(shape: ShapeContents) -> ShapeContents:

@@ -132,15 +132,14 @@ class ShapeReader:
         names = COLORS if material is None else material.primvars()
         constants = {name: self._constant(prim, name) for name in names if name not in cage.attributes}
         constants = {name: values for name, values in constants.items() if values}
-        radiance = None
+        radiance, is_normalized = None, False
         if prim.HasAPI(UsdLux.MeshLightAPI):
-            if value_at(UsdLux.LightAPI(prim).GetNormalizeAttr(), self._time):
-                self._notes.add("normalize of mesh lights is ignored", prim.GetPath())
+            is_normalized = bool(value_at(UsdLux.LightAPI(prim).GetNormalizeAttr(), self._time))
             radiance = read_emission(prim, self._time).tolist()
             if not np.isfinite(radiance).all():
                 self._notes.add("mesh lights with numbers that are not finite are ignored", prim.GetPath())
                 radiance = None
-        return ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, constants, radiance)
+        return ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, constants, radiance, is_normalized)
 
     def _with_texcoords(self, prim: Usd.Prim, cage: CageContents, name: str, fallback: Input | None) -> CageContents:
         """A cage with texture coordinates of a name, or else with others of its own or the fallback."""

@@ -629,7 +629,20 @@ def rect_form_factor(a, b, distance):
     return 2 / np.pi * (a / one * np.arctan(b / one) + b / two * np.arctan(a / two))
 
 
+def mesh_light(*body):
+    """Normalised, three times two units wide in the world, and shining down."""
+    place = moved(translate=(0, 0, 4), rotateXYZ=(180, 0, 0), scale=(1.5, 1, 1))
+    lamp = prim("Mesh", "lamp", *body, NORMALIZED, "float inputs:intensity = 50", place, apis=["MeshLightAPI"])
+    return lamp, 50 / 6 * np.pi * rect_form_factor(1.5, 1, 4)
+
+
 LIGHTS = {
+    "mesh": mesh_light(SQUARE),
+    "subdivided mesh": mesh_light(
+        SMOOTH_SQUARE,
+        CREASES.replace("0, 1, 3", "0, 1, 2, 3, 0").replace("[3]", "[5]").replace("2.5", "10, 10, 10, 10"),
+    ),
+    "point of a sphere without a radius": (light("SphereLight", NORMALIZED, radius=0, intensity=100), 25 / 16),
     "rect": (light("RectLight", width=2, height=3, intensity=5), 5 * np.pi * rect_form_factor(1, 1.5, 4)),
     "rect, normalised, scaled": (
         light("RectLight", NORMALIZED, width=2, height=3, exposure=3, scale=0.5),
@@ -882,7 +895,10 @@ IGNORED = [
     *((frame(line), message, "(/settings)") for line, message in IGNORED_SETTINGS),
     *((frame(of_camera=line), message, "(/camera)") for line, message in IGNORED_OF_CAMERAS),
     *((light("SphereLight", line, apis=SHAPED), message, "(/lamp)") for line, message in IGNORED_OF_LIGHTS),
-    (light("DiskLight", f"{CONE}40"), "shaping:cone:angle of lights is ignored; ", "(/lamp)"),
+    (light("DiskLight", f"{CONE}40"), "shaping:cone:angle of lights is ignored; Mitsuba's area lights", "(/lamp)"),
+    (light("SphereLight", "asset inputs:shaping:ies:file = @a.ies@"), "; Mitsuba has no lights with IES", "(/lamp)"),
+    (light("SphereLight", "float mitsuba:gain = 2"), "attributes of Mitsuba are ignored at", "(mitsuba:gain of /lamp)"),
+    *((light("SphereLight", f"{CONE}{c}", radius=r), "without power", "(/lamp)") for c, r in ((0, 1), (90, 0))),
     *((changed(old, new), message, ")") for old, new, message in IGNORED_INPUTS),
 ]
 
