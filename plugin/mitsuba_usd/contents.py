@@ -133,6 +133,7 @@ class ShapeContents:
     # (n,) int: faces with this material, of a limit surface that is evaluated whole; None for all. Parts of polygon
     # meshes and of large surfaces have the other faces as holes.
     shown_faces: NDArray | None = None
+    rate: int | None = None  # Segments on each edge, where the stage says
 
     @property
     def is_displaced(self) -> bool:

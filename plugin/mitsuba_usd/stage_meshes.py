@@ -28,6 +28,8 @@ MOST_SHARED_FACES = 1_000_000
 AROUND, ALONG = 64, 24
 # Even permutations of the coordinates that take z to an axis.
 _TURNS = {"X": (2, 0, 1), "Y": (1, 2, 0), "Z": (0, 1, 2)}
+# Of subdivision, as the shape `subdivision` has 1024 segments on each edge at most.
+_MOST_LEVELS = 10
 _NO_FACES: IntArray = np.zeros(0, np.int64)
 # Points and normals along the profile of a surface of revolution, as (distance, z).
 Line = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -77,8 +79,14 @@ class ShapeReader:
                     shown = np.flatnonzero(owner == number)
                 else:
                     cage = replace(cage, holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
-            shapes.append(replace(self._shape(prim, to_world, cage, normals, material), shown_faces=shown))
+            shape = self._shape(prim, to_world, cage, normals, material)
+            shapes.append(replace(shape, shown_faces=shown, rate=self._rate(prim)))
         return shapes
+
+    def _rate(self, prim: Usd.Prim) -> int | None:
+        """Segments on each edge by the levels of subdivision that hdMitsuba reads."""
+        level = value_at(prim.GetAttribute("mitsuba:subdivision_level"), self._time)
+        return 2 ** min(level, _MOST_LEVELS) if isinstance(level, int) and level >= 0 else None
 
     def _note_velocities(self, mesh: UsdGeom.Mesh) -> None:
         """Note velocities where points are not those of a sample."""

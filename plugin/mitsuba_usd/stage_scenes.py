@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
-from .displacement import with_displacements
+from .own_parameters import with_own_parameters
 from .picture_detail import is_chosen, segments_of, texels_for_pictures, triangles_for_picture, with_rate
 from .scaling import scaled, scaled_camera, size_of
 from .scene_entries import LoadedShapes, Surfaces, scene_entries
@@ -203,7 +203,7 @@ class StageScenes:
             contents, parameters = self._with_copies(contents)
         textures = Textures(self._notes, needed, self._look.texture_size)
         sees = [rest["sensor"]] if rest and self._has_free_rates else None
-        chosen = with_displacements(contents, chosen, parameters, sees, textures, self._notes)
+        chosen = with_own_parameters(contents, chosen, parameters, sees, textures, self._notes)
         scene = scene_entries(contents, rest, self._notes, parameters, self._surfaces, textures, chosen)
         self._notes.warn(self.name)
         if not rest:
@@ -264,7 +264,7 @@ class StageScenes:
             textures = Textures(self._notes, self._needed, self._look.texture_size)
             others = {**rest, "sensor": seen}
             any_sensor: list[SceneNode] | None = [] if self._has_free_rates else None
-            chosen = with_displacements(contents, {}, parameters, any_sensor, textures, self._notes)
+            chosen = with_own_parameters(contents, {}, parameters, any_sensor, textures, self._notes)
             made = contents, others, self._notes, parameters, Surfaces(), textures, chosen
             scene = scene_entries(*made, loaded=shapes)
             self._notes.warn(self.name)

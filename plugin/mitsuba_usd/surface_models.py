@@ -150,7 +150,7 @@ def preview_surface(i: Given) -> dict[str, Input]:
         presence = node("ifgreatereq", "float", value1=opacity, value2=threshold, in1=1.0, in2=0.0)
     elif mode == "transparent" or (mode in ("", 0.0) and is_constant(opacity)):
         presence, transmission = 1.0, node("invert", "float", in_=opacity, amount=1.0)
-    base = times(i("diffuseColor"), _below_coat(i("clearcoat"), 1.5))
+    base = times(i("diffuseColor"), _below_coat(i("clearcoat"), i("ior")))
     return {
         "base_color": base,
         "metalness": 0.0 if is_specular else i("metallic"),
@@ -161,6 +161,7 @@ def preview_surface(i: Given) -> dict[str, Input]:
         "transmission": transmission,
         "coat": i("clearcoat"),
         "coat_roughness": i("clearcoatRoughness"),
+        "coat_ior": i("ior"),
         "emission": i("emissiveColor"),
         "opacity": presence,
     }

@@ -142,3 +142,12 @@ def test_the_street_of_the_gallery_has_stones(variant_llvm_ad_rgb):  # noqa: ARG
     assert street["tessellation_rate"] > 8
     # Between joints and tops, 0.16 times 1 apart, with some grain.
     assert 0.15 < np.ptp(np.quantile(heights, [0.02, 0.98])) < 0.18
+
+
+def test_levels_of_subdivision_are_rates(tmp_path, variant_scalar_rgb):  # noqa: ARG001
+    """Options of the command win."""
+    path = stages.write(tmp_path, mesh("sheet", SHEET, "int mitsuba:subdivision_level = 4"))
+    counts = [
+        msub.usd_scene(path, mi, **options)["sheet"]["tessellation_rate"] for options in ({}, {"tessellation_rate": 3})
+    ]
+    assert counts == [16, 3]

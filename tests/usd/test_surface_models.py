@@ -210,12 +210,12 @@ def test_models_agree_where_they_mean_the_same():
     ):
         lobe = bsdf_of(model, **given, **{color: COLOR})
         assert [*lobe["base_color"]["value"], lobe["roughness"], lobe["eta"]] == pytest.approx([*COLOR, 0.4, 1.6])
-    # Reflections are the same from the inside.
+    # Reflections are the same from the inside. By the specification, the coat has the same index.
     given = {"metallic": 0.4, "ior": 0.5, "clearcoat": 0.7, "clearcoatRoughness": 0.2}
     lobe = bsdf_of("UsdPreviewSurface", **given, diffuseColor=COLOR)
-    expected = {"metallic": 0.4, "eta": 2.0, "clearcoat": 0.7, "clearcoat_gloss": 0.06 / 0.099}
+    expected = {"metallic": 0.4, "eta": 2.0, "clearcoat": 0.7 / 9 / 0.04, "clearcoat_gloss": 0.06 / 0.099}
     assert {name: lobe[name] for name in expected} == pytest.approx(expected, rel=1e-5)
-    np.testing.assert_allclose(lobe["base_color"]["value"], np.array(COLOR) * (1 - 0.7 * 0.04), rtol=1e-6)
+    np.testing.assert_allclose(lobe["base_color"]["value"], np.array(COLOR) * (1 - 0.7 / 9), rtol=1e-6)
 
 
 ROUGH_METAL = {"metalness": 1.0, "specular_roughness": 0.5, "specular_anisotropy": 0.75}

@@ -1,4 +1,4 @@
-"""Displacement of limit surfaces by their materials, at rates that show it."""
+"""Parameters that some limit surfaces have of their own: displacements at rates that show them, and rates."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from .textures import Textures
 _CONSTANT = "vertex_constant_displacement"
 
 
-def with_displacements(
+def with_own_parameters(
     contents: SceneContents,
     chosen: Mapping[ShapeContents, dict[str, Any]],  # Parameters of some limit surfaces
     parameters: dict[str, Any],  # Of the others; a displacement replaces those of materials
@@ -29,7 +29,7 @@ def with_displacements(
     textures: Textures,
     notes: StageWarnings,
 ) -> dict[ShapeContents, dict[str, Any]]:
-    """Parameters of limit surfaces, with the displacements of their materials."""
+    """Parameters of limit surfaces, with the displacements of their materials and the rates of the stage."""
     shapes = [shape for shape in contents.all_shapes if shape.is_displaced and "displacement" not in parameters]
     copies: dict[ShapeContents, list[NDArray[np.float64]]] = {shape: [] for shape in shapes}
     for shape, to_world in contents.placed_shapes if shapes else ():
@@ -51,6 +51,10 @@ def with_displacements(
                 error = studio.ERRORS[parameters["shading"]] / pixels
                 rate = max(rate, rate_of_heights(shape.cage, texture, error))
             displaced[shape]["tessellation_rate"] = max(1, min(rate, highest))
+    for shape in contents.all_shapes if sensors is not None else ():
+        if shape.rate is not None and shape.cage.scheme is not None:
+            own = {name: displaced[shape][name] for name in displaced.get(shape, ()) if "displacement" in name}
+            displaced[shape] = {**parameters, **own, "tessellation_rate": shape.rate}
     return displaced
 
 
