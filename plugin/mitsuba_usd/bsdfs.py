@@ -105,6 +105,8 @@ class _Surface:
 
     def __init__(self, shape: ShapeContents, textures: Textures, notes: StageWarnings) -> None:
         self._material, self._shape, self._textures, self._notes = shape.material, shape, textures, notes
+        # Plugins of Mitsuba, and parameters that they do not have.
+        self._lacking: set[tuple[str, str]] = set()
         inputs = {} if shape.material is None else shape.material.inputs
         given = {name: self._for_shape(value) for name, value in inputs.items() if name != "bsdf"}
         self._inputs: dict[str, Input] = {**NEUTRAL, **given}
@@ -136,8 +138,8 @@ class _Surface:
     def _plugin(self, given: Input, name: str = "") -> Any:
         """A parameter of a plugin of Mitsuba, or a plugin of its own."""
         if isinstance(given, NodeContents) and given.is_plugin:
-            parameters = {key: self._plugin(value, key) for key, value in given.inputs.items() if key}
-            return {"type": given.category, **parameters}
+            kept = {k: v for k, v in given.inputs.items() if k and (given.category, k) not in self._lacking}
+            return {"type": given.category, **{key: self._plugin(value, key) for key, value in kept.items()}}
         if isinstance(given, list):
             is_matrix = len(given) == 9
             return mi.ScalarAffineTransform3f(np.reshape(given, (3, 3)).tolist()) if is_matrix else rgb(given)
@@ -147,18 +149,20 @@ class _Surface:
             return self.number(given) if width_of(given) == 1 else self._color(given)
         return given
 
-    def _loadable(self, entry: SceneNode) -> SceneNode:
-        """A BSDF without the parameters that its plugins lack; grey if Mitsuba cannot load it."""
+    def _own_bsdf(self, given: Input) -> SceneNode:
+        """Mitsuba's own BSDF, without parameters that its plugins lack; grey if Mitsuba cannot load it."""
+        entry = self._plugin(given)
         try:
             if isinstance(mi.load_dict(entry), mi.BSDF):
-                return entry
+                return dict(entry)
             problem = "not a BSDF"
         except RuntimeError as error:
             problem = str(error)
         plugin, unknown = re.search(r'plugin of type "(\w+)"', problem), re.findall(r'\n  - \w+ "(.+?)":', problem)
         if plugin and unknown:
             self._leave(f"parameters that Mitsuba's {plugin[1]} does not have are ignored ({', '.join(unknown)})")
-            return self._loadable(_without(entry, plugin[1], unknown))
+            self._lacking |= {(plugin[1], name) for name in unknown}
+            return self._own_bsdf(given)
         self._leave(f"materials that Mitsuba cannot load are grey ({problem.rpartition('] ')[2].splitlines()[0]})")
         return _both_sides({"type": "diffuse", "reflectance": rgb(GREY)})
 
@@ -178,7 +182,6 @@ class _Surface:
         return np.asarray(value.fallback if isinstance(value, PrimvarContents) else value, dtype=np.float64)
 
     def _is(self, name: str, value: float) -> bool:
-        """Whether an input has a value everywhere."""
         return is_all(self._inputs[name], value)
 
     def _leave(self, what: str) -> None:
@@ -191,7 +194,7 @@ class _Surface:
             opacity = self.number(PrimvarContents("displayOpacity", [1.0]))
             return _masked(_both_sides({"type": "diffuse", "reflectance": color}), opacity)
         if "bsdf" in self._material.inputs:
-            return self._loadable(self._plugin(self._material.inputs["bsdf"]))
+            return self._own_bsdf(self._material.inputs["bsdf"])
         weight = self._inputs["transmission"]
         if not self._is("transmission", 0):
             opaque = node("invert", "float", in_=self._inputs["metalness"], amount=1.0)
@@ -201,12 +204,8 @@ class _Surface:
         elif is_constant(weight) and _first(weight) >= 1:
             entry = self._turned(self._glass(), is_diffuse=False)
         else:
-            entry = {
-                "type": "blendbsdf",
-                "weight": self.number(weight),
-                "bsdf_0": self._opaque(),
-                "bsdf_1": self._turned(self._glass(), is_diffuse=False),
-            }
+            parts = {"bsdf_0": self._opaque(), "bsdf_1": self._turned(self._glass(), is_diffuse=False)}
+            entry = {"type": "blendbsdf", "weight": self.number(weight), **parts}
         return _masked(entry, self.number(self._inputs["opacity"]))
 
     def _turned(self, bsdf: SceneNode, *, is_diffuse: bool = True) -> SceneNode:
@@ -219,13 +218,8 @@ class _Surface:
         normals = self._textures.normals(normal) if isinstance(normal, (TextureContents, NodeContents)) else None
         if normals is None:
             return bsdf
-        return {
-            "type": "normalmap",
-            "normalmap": normals,
-            "use_shadowing_function": is_diffuse,
-            "flip_invalid_normals": True,
-            "bsdf": bsdf,
-        }
+        shading = {"use_shadowing_function": is_diffuse, "flip_invalid_normals": True}
+        return {"type": "normalmap", "normalmap": normals, **shading, "bsdf": bsdf}
 
     def _opaque(self) -> SceneNode:
         if not self._is("translucency", 0):
@@ -302,12 +296,9 @@ class _Surface:
         """A sheet both sides of which are outside."""
         inputs = self._inputs
         if transmission == 1 and self._widths() is None:
-            return {
-                "type": "thindielectric",
-                "int_ior": self._eta(),
-                "ext_ior": 1.0,
-                "specular_transmittance": self._color(inputs["transmission_color"]),
-            }
+            color = self._color(inputs["transmission_color"])
+            indices = {"int_ior": self._eta(), "ext_ior": 1.0}
+            return {"type": "thindielectric", **indices, "specular_transmittance": color}
         entry: SceneNode = {
             "type": "principledthin",
             "base_color": self._color(inputs["transmission_color" if transmission == 1 else "base_color"]),
@@ -371,12 +362,6 @@ def _clamped(given: Input) -> Input:
     return node("clamp", "float", in_=given, low=0.0, high=1.0)
 
 
-def _without(entry: SceneNode, plugin: str, names: list[str]) -> SceneNode:
-    """An entry whose nodes of a plugin lack some parameters."""
-    kept = entry if entry["type"] != plugin else {key: value for key, value in entry.items() if key not in names}
-    return {k: _without(v, plugin, names) if isinstance(v, dict) and "type" in v else v for k, v in kept.items()}
-
-
 def _attribute(given: PrimvarContents) -> SceneNode:
     return {"type": "mesh_attribute", "name": f"vertex_{given.name}"}
 
@@ -396,5 +381,4 @@ def _both_sides(entry: SceneNode) -> SceneNode:
 
 
 def _masked(entry: SceneNode, opacity: SceneNode | float) -> SceneNode:
-    """A BSDF with an opacity."""
     return entry if opacity == 1 else {"type": "mask", "opacity": opacity, "bsdf": entry}

@@ -171,7 +171,6 @@ def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> S
 
 
 def _attribute(given: Attribute, corners: IntArray) -> Attribute:
-    """An attribute of all copies, with the face corners ``(n, n_h)``."""
     if given.interpolation != "face_varying":
         return Attribute(np.tile(given.values, (len(corners), 1)), given.interpolation)
     indices = np.arange(len(given.values)) if given.indices is None else given.indices

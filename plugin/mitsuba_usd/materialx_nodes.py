@@ -165,7 +165,6 @@ def _hsv(values: Values) -> Values:
 
 
 def _rgb(values: Values) -> Values:
-    """Colours of hue, saturation and value."""
     hue, saturation, value = np.moveaxis(values[..., :3], -1, 0)
     offset = np.stack([(5 + 6 * hue) % 6, (3 + 6 * hue) % 6, (1 + 6 * hue) % 6], axis=-1)
     ramp = np.clip(np.minimum(offset, 4 - offset), 0, 1)
@@ -207,7 +206,6 @@ def _perlin(points: Values, width: int) -> Values:
 
 
 def _fractal(points: Values, n: SimpleNamespace, width: int) -> Values:
-    """Sum of Perlin noises, each finer and weaker than the one before."""
     if width in (2, 4):
         return _stacked((_fractal(points, n, width - 1), _fractal(points + _ELSEWHERE_IN_SUMS, n, 1)))
     total = np.zeros((*points.shape[:-1], width))
@@ -339,25 +337,18 @@ OPERATIONS: dict[str, Callable[[SimpleNamespace], Values]] = {
     "worleynoise2d": _worley,
     "roughness_anisotropy": _roughness,
 }
-# Sets of inputs in which an operation is affine while its other inputs are constant.
+# Sets of inputs in which an operation is affine per channel while its other inputs are constant.
 AFFINE: dict[str, tuple[set[str], ...]] = {
-    **dict.fromkeys(("add", "subtract", "combine2"), ({"in1", "in2"},)),
-    **dict.fromkeys(("combine3", "combine4"), ({"in1", "in2", "in3", "in4"},)),
-    **dict.fromkeys(("extract", "convert", "rotate2d", "rotate3d", "dot"), ({"in"},)),
+    **dict.fromkeys(("add", "subtract", "combine2", "combine3", "combine4"), ({"in1", "in2", "in3", "in4"},)),
+    **dict.fromkeys(("ifgreater", "ifgreatereq", "ifequal"), ({"in1", "in2"},)),
+    **dict.fromkeys(("constant", "dot", "extract", "convert", "rotate2d"), ({"in", "value"},)),
     **dict.fromkeys(("mix", "plus", "minus"), ({"bg", "fg"}, {"mix"})),
-    **dict.fromkeys(("screen", "over"), ({"fg"}, {"bg"}, {"mix"})),
-    **dict.fromkeys(("in", "mask", "out"), ({"fg"}, {"bg"}, {"mix"})),
+    **dict.fromkeys(("screen", "over", "in", "mask", "out"), ({"fg"}, {"bg"}, {"mix"})),
     **dict.fromkeys(("inside", "outside"), ({"in"}, {"mask"})),
+    "invert": ({"in", "amount"},),
     "multiply": ({"in1"}, {"in2"}),
     "divide": ({"in1"},),
-    "dotproduct": ({"in1"}, {"in2"}),
-    "crossproduct": ({"in1"}, {"in2"}),
-    "invert": ({"in", "amount"},),
     "remap": ({"in"}, {"outlow", "outhigh"}),
-    "ifgreater": ({"in1", "in2"},),
-    "ifgreatereq": ({"in1", "in2"},),
-    "ifequal": ({"in1", "in2"},),
-    "constant": ({"value"},),
 }
 # That read texture coordinates or pictures themselves.
 SAMPLED = ("texcoord", "image", "heighttonormal")

@@ -157,7 +157,6 @@ class CachedSurface:
 
     @cached_property
     def _used(self) -> NDArray[np.bool_]:
-        """Mask of the vertices of faces that are not holes."""
         cage = self.surface.cage
         is_hole = np.isin(np.arange(cage.face_count), cage.holes)
         return np.isin(np.arange(cage.vertex_count), cage.face_vertices[np.repeat(~is_hole, cage.face_sizes)])

@@ -45,13 +45,8 @@ _NEUTRAL_SETTINGS: dict[str, list[Any]] = {
 }
 # As Gaffer writes this setting of Cycles.
 _TRANSPARENT = "cycles:background:transparent"
-_NEUTRAL_EXPOSURE = {
-    "exposure": 0.0,
-    "exposure:iso": 100.0,
-    "exposure:time": 1.0,
-    "exposure:fStop": 1.0,
-    "exposure:responsivity": 1.0,
-}
+_NEUTRAL_EXPOSURE = {"exposure": 0.0, "exposure:iso": 100.0}
+_NEUTRAL_EXPOSURE |= {"exposure:time": 1.0, "exposure:fStop": 1.0, "exposure:responsivity": 1.0}
 # The schema's fallback of clippingRange.
 _CLIPPING_RANGE = (1.0, 1e6)
 # Of aspectRatioConformPolicy, as `sensors.film_window` has them.

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 
 class _Port(NamedTuple):
-    """An input of a node, as its definition has it."""
-
     name: str
     # Type of MaterialX. Of USD's nodes "asset", "texcoord", "string", or "" for numbers; "constant" for numbers that
     # cannot be connected to shaders.
@@ -36,16 +34,12 @@ class _Port(NamedTuple):
     @property
     def width(self) -> int:
         """How many numbers it has; 0 if that is not known."""
-        if self.kind == "texcoord":
-            return 2
-        of_default = nodes.width_of(self.default) if isinstance(self.default, (float, list)) else 0
-        return nodes.CHANNELS.get(self.kind, of_default)
+        default = None if isinstance(self.default, str) else self.default
+        return nodes.CHANNELS.get(self.kind, 0 if default is None else nodes.width_of(default))
 
 
 def _texcoords(name: str, fallback: Input | None = None) -> NodeContents:
-    return NodeContents(
-        "texcoord", "vector2", {"name": name} if fallback is None else {"name": name, "fallback": fallback}
-    )
+    return NodeContents("texcoord", "vector2", {"name": name, **({} if fallback is None else {"fallback": fallback})})
 
 
 _PREVIEW_SURFACE = "UsdPreviewSurface"
@@ -65,6 +59,7 @@ _TRANSFORM_PORTS = [
     _Port("in", "texcoord", _texcoords("st")), _Port("rotation", "constant", 0.0),
     _Port("scale", "constant", [1.0, 1.0]), _Port("translation", "constant", [0.0, 0.0]),
 ]  # fmt: skip
+_DISPLACEMENT_PORTS = [_Port("displacement", "float", 0.0), _Port("scale", "float", 1.0)]
 # Of readers of primvars, by the ends of their names; others read numbers.
 _PRIMVAR_WIDTHS = {"float2": 2, "float3": 3, "float4": 4, "point": 3, "normal": 3, "vector": 3}
 _TEXTURE_OUTPUTS = ("rgb", "r", "g", "b", "a")
@@ -129,13 +124,10 @@ class MaterialReader:
 
     def _contents(self, material: UsdShade.Material) -> MaterialContents | None:
         path = material.GetPath()
-        outputs = {
-            output.GetFullName(): output for output in material.GetSurfaceOutputs() if output.HasConnectedSource()
-        }
-        contexts = {_terminal(context, "surface"): context for context in _CONTEXTS}
-        if others := sorted(outputs.keys() - contexts.keys()):
+        contexts = _contexts(material.GetSurfaceOutputs())
+        if others := [f"outputs:{name}:surface" for name in contexts if name not in _CONTEXTS]:
             self._notes.add("surfaces of other renderers are ignored", f"{', '.join(others)} of {path}")
-        found = (material.ComputeSurfaceSource(context)[0] for name, context in contexts.items() if name in outputs)
+        found = (material.ComputeSurfaceSource(name)[0] for name in _CONTEXTS if name in contexts)
         surfaces = [surface for surface in found if surface]
         read = next((inputs for inputs in map(self._surface, surfaces) if inputs is not None), None)
         if read is None:
@@ -163,8 +155,8 @@ class MaterialReader:
 
     def _displacement(self, material: UsdShade.Material) -> dict[str, Input]:
         """Heights along the normal, and their scale, where a material has a displacement."""
-        outputs = {output.GetFullName() for output in material.GetDisplacementOutputs() if output.HasConnectedSource()}
-        context = next((name for name in _CONTEXTS if _terminal(name, "displacement") in outputs), "")
+        contexts = _contexts(material.GetDisplacementOutputs())
+        context = next((name for name in _CONTEXTS if name in contexts), "")
         shader, output, _ = material.ComputeDisplacementSource(context)
         if not shader:
             return {}
@@ -172,9 +164,7 @@ class MaterialReader:
         if shader.GetShaderId() == _PREVIEW_SURFACE:
             heights = self._input(shader, _Port("displacement", "", 0.0))
         elif shader.GetShaderId() == "ND_displacement_float":
-            heights, scale = (
-                self._input(shader, _Port(n, "float", d)) for n, d in (("displacement", 0.0), ("scale", 1.0))
-            )
+            heights, scale = self._inputs(shader, _DISPLACEMENT_PORTS).values()
         else:
             heights = self._output(shader, output)
         heights, scale = 0.0 if heights is None else heights, 1.0 if scale is None else scale
@@ -224,7 +214,7 @@ class MaterialReader:
                 what = f"textures read the texture coordinates st where {port.name} is not connected"
                 self._notes.add(what, shader.GetPath())
             return port.default
-        if not _is_output(attribute):
+        if not UsdShade.Output.IsOutput(attribute):
             return self._value(attribute, port)
         if port.kind in ("constant", "string"):
             what = f"connections of {port.name} of {shader.GetShaderId()} to shaders are ignored"
@@ -261,7 +251,6 @@ class MaterialReader:
         return _IS_SRGB.get(space, False)
 
     def _default(self, declared: MaterialX.Input) -> Input | None:
-        """Default of an input without a value or connection."""
         geometry = declared.getDefaultGeomPropString()
         if geometry:
             return _texcoords("st") if geometry == "UV0" else None
@@ -321,25 +310,28 @@ class MaterialReader:
         for given in shader.GetInputs():
             key, attribute = given.GetBaseName(), next(iter(given.GetValueProducingAttributes()), None)
             value: Any = None if attribute is None else value_at(attribute, self._time)
-            if attribute is None or _is_output(attribute) or isinstance(value, Sdf.AssetPath):
-                value = self._input(shader, _Port(key, "asset" if isinstance(value, Sdf.AssetPath) else ""))
+            if attribute is None or UsdShade.Output.IsOutput(attribute):
+                value = self._input(shader, _Port(key, ""))
+            elif isinstance(value, Sdf.AssetPath):
+                value = _path_of(value, attribute, self._time)
             elif not isinstance(value, (bool, int, float, str)):
                 numbers = np.asarray(value, dtype=np.float64)
                 value = (numbers.T[:3, :3] if numbers.ndim == 2 else numbers).ravel().tolist()
             parameters |= {} if value is None else {key: value}
         if name not in ("bitmap", "checkerboard"):
             return NodeContents(name, "mitsuba", parameters)
-        matrix, file = parameters.pop("to_uv", np.eye(3).ravel().tolist()), parameters.pop("filename", None)
-        if np.size(matrix) != 9:  # type: ignore[arg-type]
+        matrix: Any = parameters.pop("to_uv", np.eye(3).ravel().tolist())
+        if np.size(matrix) != 9:
             raise MaterialError(f"to_uv of {path} is no matrix")
-        to_uv = np.reshape(matrix, (3, 3)) @ V_DOWN  # type: ignore[arg-type]
-        if not isinstance(file, TextureContents):
+        to_uv = np.reshape(matrix, (3, 3)) @ V_DOWN
+        if name == "checkerboard":
             placed: dict[str, Input] = {"to_uv": to_uv.ravel().tolist(), "": _texcoords("st")}
             return NodeContents(name, "mitsuba", {**parameters, **placed})
-        space, wrap = "raw" if parameters.pop("raw", False) else "auto", str(parameters.pop("wrap_mode", "repeat"))
+        file, wrap = (str(parameters.pop(key, usual)) for key, usual in (("filename", ""), ("wrap_mode", "repeat")))
+        space = "raw" if parameters.pop("raw", False) else "auto"
         if parameters:
             self._notes.add("inputs of mitsuba_bitmap are ignored", f"{', '.join(parameters)} of {path}")
-        return replace(file, channel="rgb", color_space=space, wrap=wrap, to_uv=V_DOWN @ to_uv)
+        return TextureContents(file, "rgb", space, wrap, to_uv=V_DOWN @ to_uv)
 
     def _texture(self, shader: UsdShade.Shader, output: str) -> Input | None:
         path = shader.GetPath()
@@ -355,15 +347,9 @@ class MaterialReader:
             expected = ", ".join(_COLOR_SPACES)
             self._notes.add(f'sourceColorSpace "{space}" of textures is ignored; expected {expected}', path)
             space = "auto"
-        picture = replace(
-            file,
-            channel=output,
-            color_space=space,
-            wrap=self._wrap(given, ("wrapS", "wrapT"), path),
-            scale=given["scale"],
-            bias=given["bias"],
-            fallback=given["fallback"],
-        )
+        numbers = {name: given[name] for name in ("scale", "bias", "fallback")}
+        wrap = self._wrap(given, ("wrapS", "wrapT"), path)
+        picture = replace(file, channel=output, color_space=space, wrap=wrap, **numbers)
         return self._placed(picture, "color3" if output == "rgb" else "float", given["st"])
 
     def _wrap(self, given: dict[str, Any], names: tuple[str, str], prim: object) -> str:
@@ -422,7 +408,6 @@ class MaterialReader:
     def _expanded(
         self, graph: MaterialX.NodeGraph, output: str, given: dict[str, Input | None], prim: object
     ) -> Input | None:
-        """What a graph of the library computes."""
         made: dict[tuple[str, str], Input | None] = {}
 
         def of_port(port: Any) -> Input | None:
@@ -491,10 +476,9 @@ class MaterialReader:
             return None
         x, y = (nodes.node("extract", "float", in_=scale, index=float(k)) for k in (0, 1))
         factor = nodes.node("combine3", "vector3", in1=x, in2=y, in3=1.0)
-        turned = nodes.node(
-            "multiply", "vector3", in1=picture, in2=nodes.node("multiply", "vector3", in1=factor, in2=2.0)
-        )
-        turned = nodes.node("add", "vector3", in1=turned, in2=nodes.node("multiply", "vector3", in1=factor, in2=-1.0))
+        doubled, less = (nodes.node("multiply", "vector3", in1=factor, in2=k) for k in (2.0, -1.0))
+        turned = nodes.node("multiply", "vector3", in1=picture, in2=doubled)
+        turned = nodes.node("add", "vector3", in1=turned, in2=less)
         return replace(turned, fallback=[0.0, 0.0, 1.0, 1.0]) if isinstance(turned, TextureContents) else turned
 
 
@@ -508,14 +492,11 @@ _SPECIAL: dict[str, _Reading] = {
 }
 
 
-def _is_output(attribute: Usd.Attribute) -> bool:
-    return UsdShade.Utils.GetType(attribute.GetName()) == UsdShade.AttributeType.Output
-
-
-def _terminal(context: str, name: str) -> str:
-    return f"outputs:{context}:{name}" if context else f"outputs:{name}"
+def _contexts(outputs: list[UsdShade.Output]) -> list[str]:
+    """Renderers that connected outputs are for; "" for any."""
+    return [output.GetBaseName().rpartition(":")[0] for output in outputs if output.HasConnectedSource()]
 
 
 def _require_width(width: int, port: _Port, attribute: Usd.Attribute) -> None:
-    if not width or (port.width and width not in (1, port.width)):
+    if not width or (port.width and width != port.width and (width > 1 or port.kind == "constant")):
         raise MaterialError(f"{attribute.GetPath()} has {width} numbers; expected {port.width or 'some'}")

@@ -89,7 +89,6 @@ class ShapeReader:
         return 2 ** min(level, _MOST_LEVELS) if isinstance(level, int) and level >= 0 else None
 
     def _note_velocities(self, mesh: UsdGeom.Mesh) -> None:
-        """Note velocities where points are not those of a sample."""
         if self._time.IsEarliestTime() or not mesh.GetVelocitiesAttr().HasAuthoredValue():
             return
         time = self._time.GetValue()
@@ -151,17 +150,17 @@ class ShapeReader:
 
     def _with_texcoords(self, prim: Usd.Prim, cage: CageContents, name: str, fallback: Input | None) -> CageContents:
         """A cage with texture coordinates of a name, or else with others of its own or the fallback."""
-        is_missing = not UsdGeom.PrimvarsAPI(prim).HasPrimvar(name)
-        if cage.texcoords is not None and (fallback is None or not is_missing):
-            if is_missing:
-                what = f'texture coordinates "{name}" are missing; the first others of the mesh are used'
-                self._notes.add(what, prim.GetPath())
-            return cage
-        place = np.zeros(2) if fallback is None else constant(fallback, 2)
+        is_missing, consequence = (
+            not UsdGeom.PrimvarsAPI(prim).HasPrimvar(name),
+            "the first others of the mesh are used",
+        )
+        if cage.texcoords is None or (is_missing and fallback is not None):
+            place = np.zeros(2) if fallback is None else constant(fallback, 2)
+            consequence = f"textures are read at ({', '.join(map(in_digits, place.tolist()))})"
+            cage = replace(cage, texcoords=Attribute(np.tile(place, (len(cage.positions), 1)), "vertex"))
         if is_missing:
-            at = ", ".join(map(in_digits, place.tolist()))
-            self._notes.add(f'texture coordinates "{name}" are missing; textures are read at ({at})', prim.GetPath())
-        return replace(cage, texcoords=Attribute(np.tile(place, (len(cage.positions), 1)), "vertex"))
+            self._notes.add(f'texture coordinates "{name}" are missing; {consequence}', prim.GetPath())
+        return cage
 
     def _constant(self, prim: Usd.Prim, name: str) -> list[float]:
         """A primvar of a prim, or of those above, that has one value of one or three numbers; else nothing."""

@@ -95,7 +95,6 @@ class StageScenes:
         return contents
 
     def _read(self, number: int | None, delay: float = 0.0) -> SceneContents:
-        """Contents of a frame, or of a sub-frame so many time codes later."""
         path, time = self._path, self._time
         if self._files is not None and number is not None:
             path, time = self._files.file(number), self._files.time(number)
@@ -131,7 +130,6 @@ class StageScenes:
         return replace(self._before[1], camera=camera, resolution=given.resolution)
 
     def _delays(self, first: SceneContents) -> list[float]:
-        """Times of sub-frames after the time of a frame."""
         if self._shutter is None:
             return [0.0]
         opens, closes = self._interval or (first.camera.shutter if first.camera else (0.0, 0.0))
@@ -272,7 +270,6 @@ class StageScenes:
             yield before[2]
 
     def _sensor(self, contents: SceneContents, first: SceneContents, rest: SceneNode) -> SceneNode:
-        """The camera of a frame."""
         if contents.camera is None:
             return dict(rest["sensor"])
         return sensor(contents.camera, size_for(first, self._look), self._look.spp, self._notes)
@@ -306,7 +303,6 @@ def _moved_sensor(loaded: studio.LoadedScene, before: SceneNode, seen: SceneNode
 
 
 def _turned(sensor: SceneNode, turn: NDArray[np.float64]) -> SceneNode:
-    """A sensor, moved by a transform ``(4, 4)``."""
     return {**sensor, "to_world": mi.ScalarTransform4f(turn.tolist()) @ sensor["to_world"]}
 
 

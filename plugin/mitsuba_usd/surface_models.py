@@ -318,21 +318,12 @@ LEFT_OUT: dict[str, tuple[str, ...]] = {
     "UsdPreviewSurface": (),
     "gltf_pbr": ("iridescence", "dispersion"),
 }  # fmt: skip
-# What inputs of UsdPreviewSurface are where they are not authored.
+# Inputs of UsdPreviewSurface and their defaults.
 PREVIEW: dict[str, Input] = {
-    "diffuseColor": [0.18, 0.18, 0.18],
-    "emissiveColor": BLACK,
-    "useSpecularWorkflow": 0.0,
-    "specularColor": BLACK,
-    "metallic": 0.0,
-    "roughness": 0.5,
-    "clearcoat": 0.0,
-    "clearcoatRoughness": 0.01,
-    "opacity": 1.0,
-    "opacityMode": "",
-    "opacityThreshold": 0.0,
-    "ior": 1.5,
-}
+    "diffuseColor": [0.18, 0.18, 0.18], "emissiveColor": BLACK, "useSpecularWorkflow": 0.0, "specularColor": BLACK,
+    "metallic": 0.0, "roughness": 0.5, "clearcoat": 0.0, "clearcoatRoughness": 0.01, "ior": 1.5,
+    "opacity": 1.0, "opacityMode": "", "opacityThreshold": 0.0,
+}  # fmt: skip
 
 
 def with_shape(given: Input, values: Mapping[str, list[float]]) -> Input:

@@ -117,7 +117,6 @@ def _resampled(values: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np
 
 
 def _full(dtype: np.dtype) -> int:
-    """The value that means 1."""
     return int(np.iinfo(dtype).max) if dtype.kind == "u" else 1
 
 
@@ -265,7 +264,6 @@ def _halved(pixels: NDArray, count: int, is_srgb: bool) -> NDArray:
 
 
 def _half(values: NDArray) -> NDArray:
-    """Half an image of 16 bits or of floats."""
     height, width = values.shape[:2]
     if height % 2 or width % 2:
         half = _resampled(values.astype(np.float32), ((height + 1) // 2, (width + 1) // 2))

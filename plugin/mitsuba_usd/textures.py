@@ -282,7 +282,6 @@ def _procedural_wrap(expression: NodeContents) -> str:
 
 
 def _looked_up(values: Values, uv: Values, wrap: str) -> Values:
-    """Bilinear interpolation at ``(..., 2)``, whose v points up."""
     from scipy.ndimage import map_coordinates
 
     height, width = values.shape[:2]
