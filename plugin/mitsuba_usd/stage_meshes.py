@@ -8,7 +8,7 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
-from mitsuba_subdivision.cage import Attribute, CageContents, CageError, CageSource, in_digits, require_range, shortened
+from mitsuba_subdivision.cage import Attribute, CageContents, CageError, CageSource, require_range, shortened
 from mitsuba_subdivision.files import MeshReader, Skinning, require_types, value_at
 from mitsuba_subdivision.mesh import IntArray
 from numpy.typing import NDArray
@@ -156,7 +156,7 @@ class ShapeReader:
         )
         if cage.texcoords is None or (is_missing and fallback is not None):
             place = np.zeros(2) if fallback is None else constant(fallback, 2)
-            consequence = f"textures are read at ({', '.join(map(in_digits, place.tolist()))})"
+            consequence = f"textures are read at ({place[0]:g}, {place[1]:g})"
             cage = replace(cage, texcoords=Attribute(np.tile(place, (len(cage.positions), 1)), "vertex"))
         if is_missing:
             self._notes.add(f'texture coordinates "{name}" are missing; {consequence}', prim.GetPath())

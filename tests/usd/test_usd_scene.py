@@ -568,6 +568,11 @@ def test_textures_read_the_coordinates_that_they_name(shown):
     picture, messages = told(shown, texture("quadrants.png", name="other"), other, side=8)
     assert not messages
     np.testing.assert_allclose(picture.mean(axis=(0, 1)), [0, 0, 1], atol=0.02)
+    fallback = "float2 inputs:fallback = (0.2, 0.8)\nstring inputs:varname"
+    nodes = texture("quadrants.png", name="none").replace("string inputs:varname", fallback)
+    picture, (message,) = told(shown, nodes, side=4)
+    assert message.endswith('"none" are missing; textures are read at (0.2, 0.8) (/square)')
+    np.testing.assert_allclose(picture, np.broadcast_to([1, 0, 0], picture.shape), atol=1e-6)
     picture = shown(texture("quadrants.png", where="inputs:st = (0.75, 0.75)"), side=4)
     np.testing.assert_allclose(picture, np.broadcast_to([0, 1, 0], picture.shape), atol=1e-6)
 
@@ -638,10 +643,7 @@ def mesh_light(*body):
 
 LIGHTS = {
     "mesh": mesh_light(SQUARE),
-    "subdivided mesh": mesh_light(
-        SMOOTH_SQUARE,
-        CREASES.replace("0, 1, 3", "0, 1, 2, 3, 0").replace("[3]", "[5]").replace("2.5", "10, 10, 10, 10"),
-    ),
+    "subdivided mesh": mesh_light(SMOOTH_SQUARE),
     "point of a sphere without a radius": (light("SphereLight", NORMALIZED, radius=0, intensity=100), 25 / 16),
     "rect": (light("RectLight", width=2, height=3, intensity=5), 5 * np.pi * rect_form_factor(1, 1.5, 4)),
     "rect, normalised, scaled": (
@@ -869,6 +871,7 @@ IGNORED_INPUTS = [
     ('"repeat"', '"black"', 'textures with the wrap mode "black" use "clamp"'),
     ('"sRGB"', '"acescg"', 'sourceColorSpace "acescg" of textures is ignored; expected auto, raw, sRGB'),
     (RGB, "float inputs:gain = 2\n...", "does not have are ignored (gain of /paint/te"),
+    ("color3f inputs:diffuseColor.", "normal3f inputs:normal.", "normal maps of eight bits are normals from 0 to 1"),
     (RGB, f"float4 inputs:scale.connect = {READER}\n...", "connections of scale of "),
     (f"float2 inputs:st.connect = {READER}", "", "read the texture coordinates st where st is not"),
     ('varname = "st"', 'varname = "missing"', 'texture coordinates "missing" are missing; textures are read at (0, 0)'),
