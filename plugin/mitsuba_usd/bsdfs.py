@@ -22,7 +22,7 @@ GREY = [0.5, 0.5, 0.5]
 _DULL, _GLOSSY = 0.1, 0.001
 # Above it, nearly all light is reflected.
 _MOST_ETA = 1000.0
-# What the coat of `principled` reflects head-on.
+# Reflectance of the coat of `principled` at normal incidence.
 _COAT = 0.04
 # Lobes as narrow as this are mirrors: float32 has no more, and `principled` has no narrower ones.
 _MIRROR = 0.001
@@ -113,7 +113,7 @@ class _Surface:
         self._inputs |= {name: _clamped(self._inputs[name]) for name in _FRACTIONS}
 
     def _for_shape(self, given: Input) -> Input:
-        """An input with attributes as the constants that they are for the shape; as a whole, it may be an attribute."""
+        """An input in which constant primvars of the shape are numbers; as a whole, it may be a varying primvar."""
         names = {leaf.name for leaf in leaves(given) if isinstance(leaf, PrimvarContents)}
         if not names:
             return given
@@ -293,7 +293,7 @@ class _Surface:
         return {"type": "roughdielectric", "distribution": "ggx", **entry, **widths}
 
     def _sheet(self, transmission: float) -> SceneNode:
-        """A sheet both sides of which are outside."""
+        """A thin-walled BSDF."""
         inputs = self._inputs
         if transmission == 1 and self._widths() is None:
             color = self._color(inputs["transmission_color"])
@@ -311,14 +311,14 @@ class _Surface:
         return entry
 
     def _reflectance(self, name: str) -> float:
-        """What an index of refraction reflects head-on."""
+        """Reflectance of an index of refraction at normal incidence."""
         eta = max(_first(self._mean(name)), 0.0)
         if not is_constant(self._inputs[name]):
             self._leave("textures of indices of refraction are replaced by their means")
         return ((eta - 1) / (eta + 1)) ** 2
 
     def _eta(self) -> float:
-        """Index of refraction of what reflects as much head-on: white, from outside."""
+        """Index of refraction of the specular layer, from outside; its colour counts by its brightness."""
         color = np.broadcast_to(self._mean("specular_color"), (3,))
         if np.ptp(color) > 0 and not self._is("metalness", 1):
             self._leave("specularColor and specular_color only set the brightness of reflections, which are white")

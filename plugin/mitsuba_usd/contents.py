@@ -88,10 +88,11 @@ def leaves(given: Input) -> list[Source]:
 
 @dataclass(frozen=True, eq=False)
 class MaterialContents:
-    """What a surface looks like, in the terms that all models of surfaces share."""
+    """A material, in the terms that all models of surfaces share, or as a BSDF of Mitsuba."""
 
     name: str  # Path of the prim
-    inputs: dict[str, Input]  # By the names of `surface_models.NEUTRAL`, those that are not neutral
+    # By the names of `surface_models.NEUTRAL`, without defaults; or "bsdf", a plugin of Mitsuba
+    inputs: dict[str, Input]
 
     @property
     def is_emissive(self) -> bool:

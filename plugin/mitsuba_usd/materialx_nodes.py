@@ -1,8 +1,8 @@
 """Nodes of MaterialX: what they compute, and expressions of them, with what is constant computed at once.
 
-Values are arrays ``(..., k)`` with the channels of a type last. What a category computes is what the library of
-MaterialX 1.39 says in its shaders (``libraries/stdlib/genglsl``); categories that the library builds of others are not
-here. Noises, of points ``(..., 2)``, are those of Open Shading Language (``oslnoise.h``).
+Values are arrays ``(..., k)`` with the channels of a type last. Nodes compute what the shaders of MaterialX 1.39 do
+(``libraries/stdlib/genglsl``); its node graphs are expanded elsewhere. Noises of points ``(..., 2)`` are those of Open
+Shading Language (``oslnoise.h``).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ CHANNELS = {
 }  # fmt: skip
 # Luminance of linear Rec. 709.
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-# Makes Perlin noise be from -1 to 1 about.
+# Scales Perlin noise to about -1 to 1.
 _PERLIN_SCALE = 0.6616
-# Where the last components of noises are taken from, of single ones and of sums.
+# Offsets of the last components of noises, single ones and sums.
 _ELSEWHERE, _ELSEWHERE_IN_SUMS = np.array([19.0, 73.0]), np.array([19.0, 193.0])
 
 # Values (..., k) of a picture at texture coordinates (..., 2), or for None at the points of an evaluation.
@@ -80,7 +80,7 @@ def evaluate(
 
 
 def operation(category: str, kind: str, inputs: Mapping[str, Any]) -> Values:
-    """What a category computes of values; ``kind`` is the type of its output."""
+    """Values of a node whose output has the type ``kind``. Raises MaterialError for inputs of other types."""
     named = {"in_" if name == "in" else name: value for name, value in inputs.items()}
     arguments = SimpleNamespace(**{**named, "kind": kind, "width": CHANNELS[kind]})
     try:
@@ -88,7 +88,7 @@ def operation(category: str, kind: str, inputs: Mapping[str, Any]) -> Values:
             values = np.asarray(OPERATIONS[category](arguments))
     except (IndexError, ValueError):
         raise MaterialError(f"{category} of {', '.join(inputs)} of other types") from None
-    # As shaders do, which have no way to say that there is no number.
+    # Shaders have no NaN.
     return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
 
 
@@ -107,7 +107,7 @@ def _stacked(values: tuple[Values, ...]) -> Values:
 
 
 def _converted(n: SimpleNamespace) -> Values:
-    """Of another width: repeated, cut off, or with an alpha of 1, or with zeros."""
+    """Values of another width: repeated, truncated, or extended by an alpha of 1 or zeros."""
     values, width = n.in_, n.width
     if values.shape[-1] == 1:
         values = np.broadcast_to(values, (*values.shape[:-1], 3 if n.kind == "color4" else width))
@@ -172,7 +172,7 @@ def _rgb(values: Values) -> Values:
 
 
 def _blended(blend: Callable[[Values, Values], Values]) -> Callable[[SimpleNamespace], Values]:
-    """Of a foreground and a background, mixed with the background."""
+    """Blend of foreground and background, mixed with the background."""
     return lambda n: _mixed(n.bg, blend(n.fg, n.bg), n.mix)
 
 
@@ -350,7 +350,7 @@ AFFINE: dict[str, tuple[set[str], ...]] = {
     "divide": ({"in1"},),
     "remap": ({"in"}, {"outlow", "outhigh"}),
 }
-# That read texture coordinates or pictures themselves.
+# Categories that read texture coordinates or images.
 SAMPLED = ("texcoord", "image", "heighttonormal")
 
 
@@ -365,10 +365,10 @@ def node(category: str, kind: str, **inputs: Input) -> Input:
 
 
 def node_of(category: str, kind: str, given: dict[str, Input]) -> Input:
-    """An expression: a node of a type, or what it comes to.
+    """A node of a type, simplified.
 
-    What has only constant inputs is computed, what changes nothing is left out, and a picture whose channels are
-    chosen, scaled and moved by constants stays a picture.
+    Constants are folded, nodes without effect are left out, and an image whose channels are selected, scaled and offset
+    by constants stays an image.
     """
     if category in SAMPLED:
         return NodeContents(category, kind, given)
@@ -411,7 +411,7 @@ def is_all(given: Input, value: float) -> bool:
 
 
 def _without_effect(category: str, kind: str, given: dict[str, Input]) -> Input | None:
-    """The input that a node comes to; None if it changes its inputs."""
+    """The input that a node passes through unchanged; None if it changes its inputs."""
     chosen: Input | None = None
     if category in ("constant", "dot"):
         return given["value" if category == "constant" else "in"]

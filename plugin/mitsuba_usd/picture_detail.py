@@ -100,7 +100,7 @@ def segments_of(
 def texels_for_pictures(contents: SceneContents, sensors: Sequence[SceneNode]) -> dict[str, float]:
     """Pixels along the sides of textures that pictures by sensors show at most, by file; of tiles, along those of each.
 
-    Files of which the detail is unknown are missing, or have no bound.
+    Files of unknown detail are missing, or infinite.
     """
     seen = [(studio.outline_for(sensor), sensor["near_clip"]) for sensor in sensors]
     matrices: dict[ShapeContents, list[NDArray[np.float64]]] = {}

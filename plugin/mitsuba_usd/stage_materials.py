@@ -1,4 +1,4 @@
-"""Materials of a stage as plain data: networks of shaders of USD itself and of MaterialX, as expressions."""
+"""Materials of a stage as plain data: shading networks of USD, MaterialX and Mitsuba, as expressions."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def _path_of(asset: Any, attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
 
 
 class MaterialReader:
-    """Reads materials, each once, by networks of shaders of USD and of those that are definitions of MaterialX."""
+    """Reads materials, each once: shading networks of USD, MaterialX and Mitsuba."""
 
     def __init__(self, time: Usd.TimeCode, notes: StageWarnings) -> None:
         self._time, self._notes = time, notes
@@ -109,7 +109,7 @@ class MaterialReader:
         return None
 
     def _material(self, material: UsdShade.Material) -> MaterialContents | None:
-        """A material; None if it is not supported. Of those that differ by their names only, it is the first."""
+        """A material, or an equal one with another name; None if it is not supported."""
         path = str(material.GetPath())
         if path not in self._materials:
             try:
@@ -208,7 +208,7 @@ class MaterialReader:
         if attribute is None:
             stage = shader.GetPrim().GetStage()
             if given and not all(stage.GetPropertyAtPath(path) for path in given.GetAttr().GetConnections()):
-                what = "connections of inputs to what is not there are ignored"
+                what = "connections of inputs to missing attributes are ignored"
                 self._notes.add(what, given.GetAttr().GetPath())
             if port.kind == "texcoord":
                 what = f"textures read the texture coordinates st where {port.name} is not connected"

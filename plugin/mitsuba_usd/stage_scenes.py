@@ -155,7 +155,7 @@ class StageScenes:
         return contents.camera is None or not contents.is_lit
 
     def remarks(self) -> list[str]:
-        """What of a studio is added to the stage, and whether several frames are one picture."""
+        """Remarks on parts of the studio that are added, and on frames that are all the same."""
         contents, reader = self._first and self._first[1], self._reader
         if contents is None or reader is None:
             return []

@@ -35,7 +35,7 @@ _SILENT = (
     "", "Xform", "Scope", "Material", "Shader", "NodeGraph", "Camera", "GeomSubset", "Mesh", "PointInstancer", *GPRIMS,
     "SkelRoot", "Skeleton",
 )  # fmt: skip
-# Prims of which a camera's rig is built.
+# Types of prims of a camera's rig.
 _OF_RIGS = ("", "Camera", "Scope", "Xform")
 _SINGULAR = "instances with singular transforms are ignored"
 

@@ -236,7 +236,7 @@ def complement(a: Input) -> Input:
 
 
 def reflectance(ior: Input) -> Input:
-    """What an index of refraction reflects head-on."""
+    """Reflectance of an index of refraction at normal incidence."""
     root = number("divide", plus(ior, -1.0), plus(ior, 1.0))
     return number("multiply", root, root)
 
@@ -290,7 +290,7 @@ def has_white_edges(base: Input, edge: Input) -> bool:
 
 
 def _below_coat(coat: Input, ior: Input) -> Input:
-    """What of the light gets through a coat, head-on."""
+    """Transmittance of a coat at normal incidence."""
     return complement(number("multiply", coat, reflectance(ior)))
 
 

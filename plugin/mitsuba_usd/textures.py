@@ -19,14 +19,13 @@ from .materialx_nodes import Values, evaluate, fallback_of
 from .stage_warnings import StageWarnings
 from .texture_image import V_DOWN, TextureImage, is_srgb_image, linear_values, read_texture_image, with_alpha
 
-# Pixels along the unit square of what has no picture, and of what has large ones, many times.
+# Baked resolution without images, and with large tiled images.
 LEAST_PROCEDURAL, MOST = 1024, 4096
 _PIXELS_AT_ONCE = 1 << 20
 # Values (h, w, k) of a picture's channel, and the transform (3, 3) from texture coordinates to those of the picture.
 Picture = tuple[Values, NDArray[np.float64]]
-# Values (h, w, k) of an expression over a part of the plane of texture coordinates, the uppermost row first; the
-# transform (3, 3) from texture coordinates, whose v points up, to those of the picture, from 0 to 1; and Mitsuba's name
-# of how it continues.
+# Values (h, w, k) of an expression, the uppermost row first; the transform (3, 3) from texture coordinates, whose v
+# points up, to those of the picture, from 0 to 1; and Mitsuba's wrap mode.
 Baked = tuple[NDArray[np.float32], NDArray[np.float64], str]
 
 
@@ -193,7 +192,7 @@ def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float
 
 
 def _selected(pixels: NDArray, channels: list[int]) -> NDArray:
-    """Channels of a picture; of what has no colour or no alpha, those that `with_alpha` makes."""
+    """Channels of a picture; colour or alpha that it lacks are those of `with_alpha`."""
     first, end = channels[0], channels[-1] + 1
     if pixels.shape[2] >= max(3, end):
         return pixels[..., first:end]
@@ -201,10 +200,9 @@ def _selected(pixels: NDArray, channels: list[int]) -> NDArray:
 
 
 def baked(expression: NodeContents, picture_of: Callable[[TextureContents], Picture | None]) -> Baked:
-    """Values of an expression; where there is no picture of a texture, its fallback is taken.
+    """Values of an expression, with fallbacks of missing pictures.
 
-    Where all pictures lie in one place of the plane, at the resolution of the largest; else over the unit square, which
-    repeats.
+    If all pictures have one transform, at the resolution of the largest; else over the unit square, which repeats.
     """
     sources = leaves(expression)
     textures = [source for source in sources if isinstance(source, TextureContents)]

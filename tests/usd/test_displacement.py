@@ -103,7 +103,7 @@ def test_many_instances_are_displaced_in_their_own_space(tmp_path, monkeypatch, 
     np.testing.assert_allclose(scene.ray_intersect(rays).p[2], [0.25, 0.25, 0.5], atol=1e-5)
 
 
-def test_displacement_that_is_ignored_is_told(tmp_path, variant_scalar_rgb):  # noqa: ARG001
+def test_ignored_displacements_warn(tmp_path, variant_scalar_rgb):  # noqa: ARG001
     pairs = PRIMVAR.replace("float[]", "float2[]").format([(1, 2)] * 4, "vertex")
     for text, body, expected in (
         (paint(f"{HEIGHT} = 1"), SQUARE, "displacement of meshes that are not subdivided is ignored (/sheet)"),

@@ -78,7 +78,7 @@ TOLD = [
 
 
 @pytest.mark.parametrize(("text", "message"), TOLD)
-def test_what_mitsuba_lacks_is_told(shown, text, message):
+def test_unsupported_nodes_warn(shown, text, message):
     bsdf, (warning,) = shown(text)
     assert warning.endswith(message)
     np.testing.assert_allclose(reflectances(bsdf)[0], [1, 0, 0] if ":ri:" in text else 0.5, atol=HALF_PRECISION)

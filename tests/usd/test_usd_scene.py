@@ -879,7 +879,7 @@ IGNORED_INPUTS = [
     ("reader.outputs:result>", "place.outputs:result>", "ignored (pivot of /paint/place)"),
     ("reader.outputs:result>", "odd.outputs:result>", '"Odd" are ignored, and defaults are used; expected UsdUVT'),
     ("outputs:rgb", "outputs:rgba", 'the output "rgba" of textures is not there; rgb is used'),
-    ("outputs:rgb>", "outputs:none>", "connections of inputs to what is not there are ignored (/paint/surface.inputs"),
+    ("outputs:rgb>", "outputs:none>", "connections of inputs to missing attributes are ignored (/paint/surface.inputs"),
     (RGB, "float2 inputs:scale = (1, 1)\n...", "materials whose inputs have other types than their model"),
     ("asset inputs:file = @black.png@", 'string inputs:file = "a"', "materials whose inputs have other types than the"),
     ('"UsdPreviewSurface"', "...\nfloat inputs:gain = 2", "does not have are ignored (gain of /paint/su"),
