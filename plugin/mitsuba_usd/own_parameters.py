@@ -35,7 +35,7 @@ def with_own_parameters(
     for shape, to_world in contents.placed_shapes if shapes else ():
         copies.get(shape, []).append(to_world)
     corners = sum(len(shape.cage.face_vertices) for shape in shapes)
-    highest = math.isqrt(2 * studio.MOST_TRIANGLES // max(corners, 1))
+    highest = min(math.isqrt(2 * studio.MOST_TRIANGLES // max(corners, 1)), studio.HIGHEST_RATE)
     seen = [(studio.outline_for(sensor), sensor["near_clip"]) for sensor in sensors or () if shapes]
     displaced = {**chosen}
     textures.read(texture for shape in shapes if shape.material for texture in shape.material.textures())

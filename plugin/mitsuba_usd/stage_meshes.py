@@ -11,6 +11,7 @@ import numpy as np
 from mitsuba_subdivision.cage import Attribute, CageContents, CageError, CageSource, require_range, shortened
 from mitsuba_subdivision.files import MeshReader, Skinning, require_types, value_at
 from mitsuba_subdivision.mesh import IntArray
+from mitsuba_subdivision.studio import HIGHEST_RATE
 from numpy.typing import NDArray
 from pxr import Usd, UsdGeom, UsdLux, UsdShade
 
@@ -28,8 +29,6 @@ MOST_SHARED_FACES = 1_000_000
 AROUND, ALONG = 64, 24
 # Even permutations of the coordinates that take z to an axis.
 _TURNS = {"X": (2, 0, 1), "Y": (1, 2, 0), "Z": (0, 1, 2)}
-# Of subdivision, as the shape `subdivision` has 1024 segments on each edge at most.
-_MOST_LEVELS = 10
 _NO_FACES: IntArray = np.zeros(0, np.int64)
 # Points and normals along the profile of a surface of revolution, as (distance, z).
 Line = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -86,7 +85,7 @@ class ShapeReader:
     def _rate(self, prim: Usd.Prim) -> int | None:
         """Segments on each edge by the levels of subdivision that hdMitsuba reads."""
         level = value_at(prim.GetAttribute("mitsuba:subdivision_level"), self._time)
-        return 2 ** min(level, _MOST_LEVELS) if isinstance(level, int) and level >= 0 else None
+        return min(1 << min(level, 30), HIGHEST_RATE) if isinstance(level, int) and level >= 0 else None
 
     def _note_velocities(self, mesh: UsdGeom.Mesh) -> None:
         if self._time.IsEarliestTime() or not mesh.GetVelocitiesAttr().HasAuthoredValue():

@@ -1,6 +1,7 @@
 """A neutral studio around a model: camera, lights and backdrop, turntables, frames, and scenes saved as XML."""
 
 from ..regression.scene import LoadedScene
+from ..tessellation import HIGHEST_RATE
 from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
 from .cage_scenes import frame_table, studio_scene
 from .picture import (
@@ -37,6 +38,7 @@ __all__ = [
     "DEFAULT_VIEW",
     "ENVIRONMENT",
     "ERRORS",
+    "HIGHEST_RATE",
     "MOST_SEGMENTS",
     "MOST_TRIANGLES",
     "STUDIO",
