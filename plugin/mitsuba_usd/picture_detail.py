@@ -22,10 +22,8 @@ from .textures import samples_elsewhere
 
 # Texels for each pixel: filters see details of half a pixel, and glass magnifies.
 TEXELS_PER_PIXEL = 2.0
-# Part of the edges of a mesh that counts, as a few may have collapsed in the texture; and edges that are measured.
-_MOST_EDGES, _MOST_SAMPLES = 0.95, 20_000
-# Part of the texels that heights are shown at.
-_MOST_TEXELS = 0.99
+# Parts of the edges of a mesh, as a few may have collapsed in the texture, and of texels; and edges that are measured.
+_MOST_EDGES, _MOST_TEXELS, _MOST_SAMPLES = 0.95, 0.99, 20_000
 # Outlines of sensors and the distances of their near planes; see `outline_for`.
 Views = Sequence[tuple[SceneNode, float]]
 

@@ -22,6 +22,7 @@ from .texture_image import V_DOWN, TextureImage, is_srgb_image, linear_values, r
 # Baked resolution without images, and with large tiled images.
 LEAST_PROCEDURAL, MOST = 1024, 4096
 _PIXELS_AT_ONCE = 1 << 20
+Image = TextureContents | NodeContents
 # Values (h, w, k) of a picture's channel, and the transform (3, 3) from texture coordinates to those of the picture.
 Picture = tuple[Values, NDArray[np.float64]]
 # Values (h, w, k) of an expression, the uppermost row first; the transform (3, 3) from texture coordinates, whose v
@@ -54,9 +55,7 @@ class Textures:
             for key, picture in zip(keys, pool.map(self._read, keys), strict=True):
                 self._keep(key, picture)
 
-    def color(
-        self, given: TextureContents | NodeContents, *, is_radiance: bool = False, is_raw: bool = False
-    ) -> SceneNode:
+    def color(self, given: Image, *, is_radiance: bool = False, is_raw: bool = False) -> SceneNode:
         """A texture of colours, up to 1 unless of radiance, or the fallback of a picture that cannot be read."""
         if isinstance(given, TextureContents) and is_raw and given.color_space == "auto":
             given = replace(given, color_space="raw")
@@ -68,14 +67,14 @@ class Textures:
             picture = replace(picture, pixels=np.clip(picture.pixels, 0, most))
         return self._bitmap(use, picture, is_raw=is_raw or use.channel != "rgb")
 
-    def number(self, given: TextureContents | NodeContents) -> SceneNode | float:
+    def number(self, given: Image) -> SceneNode | float:
         """A texture of numbers, or the fallback of a picture that cannot be read."""
         use, picture = self._used(given)
         if picture is None:
             return float(_fallback(use)[0])
         return self._bitmap(replace(use, channel=use.channel[0]), picture, is_raw=True)
 
-    def normals(self, given: TextureContents | NodeContents) -> SceneNode | None:
+    def normals(self, given: Image) -> SceneNode | None:
         """A texture of normals as Mitsuba has them, from 0 to 1; None if the picture cannot be read."""
         use, picture = self._used(given)
         if picture is None:
@@ -89,14 +88,14 @@ class Textures:
         use = replace(use, scale=scale.tolist(), bias=bias.tolist(), fallback=fallback.tolist())
         return self._bitmap(use, picture, is_raw=True)
 
-    def mean(self, given: TextureContents | NodeContents) -> NDArray[np.float64]:
+    def mean(self, given: Image) -> NDArray[np.float64]:
         """Mean of a texture's values, ``(k,)``."""
         use, picture = self._used(given)
         if picture is None:
             return _fallback(use)
         return np.asarray(_values(picture, use).mean(axis=(0, 1), dtype=np.float64))
 
-    def _used(self, given: TextureContents | NodeContents) -> tuple[TextureContents, TextureImage | None]:
+    def _used(self, given: Image) -> tuple[TextureContents, TextureImage | None]:
         """A texture and its picture, or None if that cannot be read; of an expression, its values, computed once."""
         if isinstance(given, TextureContents):
             return given, self._picture(given.file, given.color_space)

@@ -14,16 +14,15 @@ COLORS = {"color0": [0.9, 0.1, 0.3], "color1": [0.2, 0.8, 0.3]}
 CHECKERS = "\n".join(f"color3f inputs:{name} = {tuple(color)}" for name, color in COLORS.items())
 MATRIX = "matrix3d inputs:to_uv = ((2, 0, 0), (0, 1, 0), (0.5, 0.25, 1))"
 # The same for column vectors; and from coordinates of USD to those of Mitsuba's bitmaps.
-TO_UV = np.array([[2, 0, 0.5], [0, 1, 0.25], [0, 0, 1]])
-FLIP = np.array([[1, 0, 0], [0, -1, 1], [0, 0, 1]])
+TO_UV, FLIP = np.array([[[2, 0, 0.5], [0, 1, 0.25], [0, 0, 1]], [[1, 0, 0], [0, -1, 1], [0, 0, 1]]])
 # Eight bits are kept in half precision.
 HALF_PRECISION = 1e-3
 
 
 def own(*nodes, kind="mitsuba_diffuse", inputs="", context="mitsuba:"):
-    outputs = "token outputs:{}surface.connect = </paint/{}.outputs:surface>"
-    both = outputs.format(context, "top"), outputs.format("", "preview")
-    return prim("Material", "paint", *both, PREVIEW, shader("top", kind, inputs, "token outputs:surface"), *nodes)
+    output, out = "token outputs:{}surface.connect = </paint/{}.outputs:surface>", "token outputs:surface"
+    outputs = output.format(context, "top"), output.format("", "preview")
+    return prim("Material", "paint", *outputs, PREVIEW, shader("top", kind, inputs, out), *nodes)
 
 
 @pytest.fixture
@@ -66,7 +65,6 @@ def test_nodes_are_plugins_with_their_parameters(shown, tmp_path, node):
     like = {**like, "to_uv": mi.ScalarAffineTransform3f((to_uv @ FLIP).tolist())}
     expected = reflectances(mi.load_dict({"type": "diffuse", "reflectance": like}))
     np.testing.assert_allclose(reflectances(bsdf), expected, atol=HALF_PRECISION)
-    assert np.ptp(expected, axis=0).max() > 0.2
 
 
 TOLD = [

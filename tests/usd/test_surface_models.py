@@ -323,9 +323,7 @@ def test_every_input_of_every_model_is_taken_or_told():
     silent |= {"subsurface_scatter_anisotropy", "occlusion", "tangent", "geometry_tangent", "geometry_coat_tangent"}
     # Of what is left itself.
     silent |= {"thin_film_IOR", "thin_film_ior", "transmission_dispersion_abbe_number", "iridescence_ior"}
-    silent |= {"iridescence_thickness", "coat_rotation", "sheen_roughness", "fuzz_roughness"}
-    # With the output of displacements.
-    silent |= {"displacement"}
+    silent |= {"iridescence_thickness", "coat_rotation", "sheen_roughness", "fuzz_roughness", "displacement"}
     silent |= {"coat_normal", "geometry_coat_normal", "clearcoat_normal", "normal", "geometry_normal"}
     for model in (*MATERIALX, "UsdPreviewSurface"):
         read = set()
