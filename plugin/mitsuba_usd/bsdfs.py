@@ -149,26 +149,26 @@ class _Surface:
             return self.number(given) if width_of(given) == 1 else self._color(given)
         return given
 
-    def _own_bsdf(self, given: Input) -> SceneNode:
-        """Mitsuba's own BSDF, without parameters that its plugins lack; grey if Mitsuba cannot load it."""
+    def _loadable(self, given: Input, kind: type) -> SceneNode | None:
+        """Mitsuba's own plugin of a kind, without parameters that it lacks; None if Mitsuba cannot load it."""
         entry = self._plugin(given)
         try:
-            if isinstance(mi.load_dict(entry), mi.BSDF):
+            if isinstance(mi.load_dict(entry), kind):
                 return dict(entry)
-            problem = "not a BSDF"
+            problem = f"not a {kind.__name__}"
         except RuntimeError as error:
             problem = str(error)
         plugin, unknown = re.search(r'plugin of type "(\w+)"', problem), re.findall(r'\n  - \w+ "(.+?)":', problem)
         if plugin and unknown:
             self._leave(f"parameters that Mitsuba's {plugin[1]} does not have are ignored ({', '.join(unknown)})")
             self._lacking |= {(plugin[1], name) for name in unknown}
-            return self._own_bsdf(given)
-        self._leave(f"materials that Mitsuba cannot load are grey ({problem.rpartition('] ')[2].splitlines()[0]})")
-        return _both_sides({"type": "diffuse", "reflectance": rgb(GREY)})
+            return self._loadable(given, kind)
+        self._leave(f"nodes that Mitsuba cannot load are ignored ({problem.rpartition('] ')[2].splitlines()[0]})")
+        return None
 
     def number(self, given: Input) -> SceneNode | float:
         if isinstance(given, NodeContents) and given.is_plugin:
-            return dict(self._plugin(given))
+            return self._loadable(given, mi.Texture) or 0.0
         value = self._for_shape(given)
         if isinstance(value, PrimvarContents):
             return _attribute(value)
@@ -194,7 +194,8 @@ class _Surface:
             opacity = self.number(PrimvarContents("displayOpacity", [1.0]))
             return _masked(_both_sides({"type": "diffuse", "reflectance": color}), opacity)
         if "bsdf" in self._material.inputs:
-            return self._own_bsdf(self._material.inputs["bsdf"])
+            own = self._loadable(self._material.inputs["bsdf"], mi.BSDF)
+            return own or _both_sides({"type": "diffuse", "reflectance": rgb(GREY)})
         weight = self._inputs["transmission"]
         if not self._is("transmission", 0):
             opaque = node("invert", "float", in_=self._inputs["metalness"], amount=1.0)

@@ -91,7 +91,7 @@ class MaterialContents:
     """A material, in the terms that all models of surfaces share, or as a BSDF of Mitsuba."""
 
     name: str  # Path of the prim
-    # By the names of `surface_models.NEUTRAL`, without defaults; or "bsdf", a plugin of Mitsuba
+    # By names of `surface_models.NEUTRAL`, without defaults, or "bsdf"; and "displacement" and its scale, in its units
     inputs: dict[str, Input]
 
     @property

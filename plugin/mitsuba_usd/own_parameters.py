@@ -46,6 +46,8 @@ def with_own_parameters(
             rate = displaced[shape]["tessellation_rate"]
             if isinstance(texture, str):
                 rate = rate if texture == _CONSTANT else max(rate, studio.MOST_SEGMENTS)
+            elif "bitmap" not in texture:
+                rate = 8 * studio.MOST_SEGMENTS
             else:
                 pixels = pixels_of(shape.cage, np.stack(placed), seen) if seen else np.inf
                 error = studio.ERRORS[parameters["shading"]] / pixels

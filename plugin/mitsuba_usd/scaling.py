@@ -38,10 +38,9 @@ def scaled(contents: SceneContents, factor: float) -> SceneContents:
         return materials.get(material, material)
 
     def of_shape(shape: ShapeContents, matrix: np.ndarray) -> ShapeContents:
-        grown = replace(shape, to_world=matrix @ shape.to_world, material=of_material(shape.material))
-        if shape.radiance is None or not shape.is_normalized:
-            return grown
-        return replace(grown, radiance=(np.array(shape.radiance) * factor**2).tolist())
+        power = factor**2 if shape.is_normalized else 1.0
+        radiance = None if shape.radiance is None else [power * channel for channel in shape.radiance]
+        return replace(shape, to_world=matrix @ shape.to_world, material=of_material(shape.material), radiance=radiance)
 
     def of_light(light: LightContents) -> LightContents:
         # What is given for a whole lamp is divided by its area, or by the square of the distance.

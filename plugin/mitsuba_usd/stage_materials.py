@@ -238,7 +238,8 @@ class MaterialReader:
         if isinstance(value, str) or port.kind == "string":
             return str(value) if port.kind == "string" else port.default
         numbers = np.asarray(value)
-        _require_width(numbers.size if numbers.dtype.kind in "biuf" else 0, port, attribute)
+        is_finite = numbers.dtype.kind in "biuf" and np.isfinite(numbers).all()
+        _require_width(numbers.size if is_finite else 0, port, attribute)
         numbers = decoded(numbers.astype(np.float64)) if self._is_srgb(port, attribute) else numbers.astype(np.float64)
         return numbers.ravel().tolist() if numbers.ndim else float(numbers)
 
@@ -499,4 +500,4 @@ def _contexts(outputs: list[UsdShade.Output]) -> list[str]:
 
 def _require_width(width: int, port: _Port, attribute: Usd.Attribute) -> None:
     if not width or (port.width and width != port.width and (width > 1 or port.kind == "constant")):
-        raise MaterialError(f"{attribute.GetPath()} has {width} numbers; expected {port.width or 'some'}")
+        raise MaterialError(f"{attribute.GetPath()}; expected {port.width or 'some'} finite numbers")

@@ -83,7 +83,6 @@ class ShapeReader:
         return shapes
 
     def _rate(self, prim: Usd.Prim) -> int | None:
-        """Segments on each edge by the levels of subdivision that hdMitsuba reads."""
         level = value_at(prim.GetAttribute("mitsuba:subdivision_level"), self._time)
         return min(1 << min(level, 30), HIGHEST_RATE) if isinstance(level, int) and level >= 0 else None
 

@@ -46,8 +46,6 @@ NEUTRAL: dict[str, Input] = {
     "sheen_color": WHITE,
     "emission": BLACK,
     "opacity": 1.0,  # Presence: 0 is a hole.
-    "displacement": 0.0,  # Heights along the normal, in the units of the mesh.
-    "displacement_scale": 1.0,
 }
 
 

@@ -69,8 +69,8 @@ def test_nodes_are_plugins_with_their_parameters(shown, tmp_path, node):
 
 TOLD = [
     (own(inputs="float inputs:gain = 2"), "that Mitsuba's diffuse does not have are ignored (gain) (/paint)"),
-    (own(kind="mitsuba_nothing"), 'cannot load are grey (Plugin "nothing" not found!) (/paint)'),
-    (own(kind="mitsuba_checkerboard"), "cannot load are grey (not a BSDF) (/paint)"),
+    (own(kind="mitsuba_nothing"), 'cannot load are ignored (Plugin "nothing" not found!) (/paint)'),
+    (own(kind="mitsuba_checkerboard"), "cannot load are ignored (not a BSDF) (/paint)"),
     (own(context="ri:"), "surfaces of other renderers are ignored (outputs:ri:surface of /paint)"),
 ]
 
