@@ -10,6 +10,7 @@ surface_models.py            models of surfaces, by the inputs that all share
 materialx_nodes.py           nodes of MaterialX, evaluated to numbers or pictures
 scaling.py                   contents in a larger unit
 copies.py                    replaces many instances by meshes
+own_parameters.py           displacements and rates of single shapes
 picture_detail.py            triangles and pixels of textures that a picture needs
 bsdfs.py, textures.py, texture_image.py, emitters.py, sensors.py   build scene entries from the data
 scene_entries.py             shapes, and all entries, for one scene or for frames

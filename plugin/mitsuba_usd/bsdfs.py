@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import ArrayLike, NDArray
 
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
-from .materialx_nodes import LUMINANCE, constant, is_all, is_constant, node
+from .materialx_nodes import LUMINANCE, constant, is_all, is_constant, node, width_of
 from .stage_warnings import StageWarnings
 from .surface_models import NEUTRAL, conductor, has_white_edges, number, with_shape
 from .textures import Textures
@@ -20,7 +22,7 @@ GREY = [0.5, 0.5, 0.5]
 _DULL, _GLOSSY = 0.1, 0.001
 # Above it, nearly all light is reflected.
 _MOST_ETA = 1000.0
-# What the coat of `principled` reflects head-on.
+# Reflectance of the coat of `principled` at normal incidence.
 _COAT = 0.04
 # Lobes as narrow as this are mirrors: float32 has no more, and `principled` has no narrower ones.
 _MIRROR = 0.001
@@ -28,6 +30,8 @@ _MIRROR = 0.001
 _LEAST_ETA = 1.001
 # Numbers beyond 0 to 1 break Mitsuba's BSDFs.
 _FRACTIONS = ("roughness", "metalness", "transmission", "opacity")
+# Parameters of Mitsuba's own BSDFs that are no colours.
+_RAW = ("normalmap", "bumpmap")
 # Vertices of paths through glass: in and out of a shell twice, with reflections between.
 _DEEPEST = 24
 # Where roulette may end a path. At Mitsuba's own depth of 5, pictures of the same noise take up to 8 % longer: chess
@@ -38,6 +42,12 @@ _ROULETTE = 3
 def bsdf(shape: ShapeContents, textures: Textures, notes: StageWarnings) -> SceneNode:
     """BSDF of a shape's material, which may read its attributes; without one, its display colour and opacity."""
     return _Surface(shape, textures, notes).bsdf()
+
+
+def heights(shape: ShapeContents, textures: Textures, notes: StageWarnings) -> tuple[SceneNode | float, float]:
+    """Heights of a displaced shape, as a texture, a ``mesh_attribute`` or a number, and their scale."""
+    surface, inputs = _Surface(shape, textures, notes), shape.material.inputs if shape.material else {}
+    return surface.number(inputs["displacement"]), _first(inputs.get("displacement_scale", 1.0))
 
 
 def radiance(material: MaterialContents, textures: Textures, notes: StageWarnings) -> SceneNode | None:
@@ -84,7 +94,8 @@ def integrator(
     Roulette ends paths through glass earlier than by default, as most of the long ones carry little.
     """
     kind = "volpath" if has_clear_lamps or any(map(absorbs, materials)) else usual["type"]
-    if all(material.inputs.get("transmission", 0.0) == 0 for material in materials):
+    # Mitsuba's own BSDFs may be glass.
+    if all(material.inputs.get("transmission", 0.0) == 0 and "bsdf" not in material.inputs for material in materials):
         return {**usual, "type": kind}
     return {**usual, "type": kind, "max_depth": max(usual["max_depth"], _DEEPEST), "rr_depth": _ROULETTE}
 
@@ -94,13 +105,15 @@ class _Surface:
 
     def __init__(self, shape: ShapeContents, textures: Textures, notes: StageWarnings) -> None:
         self._material, self._shape, self._textures, self._notes = shape.material, shape, textures, notes
+        # Plugins of Mitsuba, and parameters that they do not have.
+        self._lacking: set[tuple[str, str]] = set()
         inputs = {} if shape.material is None else shape.material.inputs
-        given = {name: self._for_shape(value) for name, value in inputs.items()}
+        given = {name: self._for_shape(value) for name, value in inputs.items() if name != "bsdf"}
         self._inputs: dict[str, Input] = {**NEUTRAL, **given}
         self._inputs |= {name: _clamped(self._inputs[name]) for name in _FRACTIONS}
 
     def _for_shape(self, given: Input) -> Input:
-        """An input with attributes as the constants that they are for the shape; as a whole, it may be an attribute."""
+        """An input in which constant primvars of the shape are numbers; as a whole, it may be a varying primvar."""
         names = {leaf.name for leaf in leaves(given) if isinstance(leaf, PrimvarContents)}
         if not names:
             return given
@@ -122,7 +135,40 @@ class _Surface:
             self._notes.add("colours that are not from 0 to 1 are clipped", self._shape.name)
         return rgb(np.clip(value, 0, 1))
 
-    def _number(self, given: Input) -> SceneNode | float:
+    def _plugin(self, given: Input, name: str = "") -> Any:
+        """A parameter of a plugin of Mitsuba, or a plugin of its own."""
+        if isinstance(given, NodeContents) and given.is_plugin:
+            kept = {k: v for k, v in given.inputs.items() if k and (given.category, k) not in self._lacking}
+            return {"type": given.category, **{key: self._plugin(value, key) for key, value in kept.items()}}
+        if isinstance(given, list):
+            is_matrix = len(given) == 9
+            return mi.ScalarAffineTransform3f(np.reshape(given, (3, 3)).tolist()) if is_matrix else rgb(given)
+        if isinstance(given, TextureContents) and name in _RAW:
+            return self._textures.color(given, is_raw=True)
+        if isinstance(given, (TextureContents, NodeContents, PrimvarContents)):
+            return self.number(given) if width_of(given) == 1 else self._color(given)
+        return given
+
+    def _loadable(self, given: Input, kind: type) -> SceneNode | None:
+        """Mitsuba's own plugin of a kind, without parameters that it lacks; None if Mitsuba cannot load it."""
+        entry = self._plugin(given)
+        try:
+            if isinstance(mi.load_dict(entry), kind):
+                return dict(entry)
+            problem = f"not a {kind.__name__}"
+        except RuntimeError as error:
+            problem = str(error)
+        plugin, unknown = re.search(r'plugin of type "(\w+)"', problem), re.findall(r'\n  - \w+ "(.+?)":', problem)
+        if plugin and unknown:
+            self._leave(f"parameters that Mitsuba's {plugin[1]} does not have are ignored ({', '.join(unknown)})")
+            self._lacking |= {(plugin[1], name) for name in unknown}
+            return self._loadable(given, kind)
+        self._leave(f"nodes that Mitsuba cannot load are ignored ({problem.rpartition('] ')[2].splitlines()[0]})")
+        return None
+
+    def number(self, given: Input) -> SceneNode | float:
+        if isinstance(given, NodeContents) and given.is_plugin:
+            return self._loadable(given, mi.Texture) or 0.0
         value = self._for_shape(given)
         if isinstance(value, PrimvarContents):
             return _attribute(value)
@@ -136,7 +182,6 @@ class _Surface:
         return np.asarray(value.fallback if isinstance(value, PrimvarContents) else value, dtype=np.float64)
 
     def _is(self, name: str, value: float) -> bool:
-        """Whether an input has a value everywhere."""
         return is_all(self._inputs[name], value)
 
     def _leave(self, what: str) -> None:
@@ -146,8 +191,11 @@ class _Surface:
         """The BSDF, with its normal map and its holes."""
         if self._material is None:
             color = self._color(PrimvarContents("displayColor", GREY))
-            opacity = self._number(PrimvarContents("displayOpacity", [1.0]))
+            opacity = self.number(PrimvarContents("displayOpacity", [1.0]))
             return _masked(_both_sides({"type": "diffuse", "reflectance": color}), opacity)
+        if "bsdf" in self._material.inputs:
+            own = self._loadable(self._material.inputs["bsdf"], mi.BSDF)
+            return own or _both_sides({"type": "diffuse", "reflectance": rgb(GREY)})
         weight = self._inputs["transmission"]
         if not self._is("transmission", 0):
             opaque = node("invert", "float", in_=self._inputs["metalness"], amount=1.0)
@@ -157,13 +205,9 @@ class _Surface:
         elif is_constant(weight) and _first(weight) >= 1:
             entry = self._turned(self._glass(), is_diffuse=False)
         else:
-            entry = {
-                "type": "blendbsdf",
-                "weight": self._number(weight),
-                "bsdf_0": self._opaque(),
-                "bsdf_1": self._turned(self._glass(), is_diffuse=False),
-            }
-        return _masked(entry, self._number(self._inputs["opacity"]))
+            parts = {"bsdf_0": self._opaque(), "bsdf_1": self._turned(self._glass(), is_diffuse=False)}
+            entry = {"type": "blendbsdf", "weight": self.number(weight), **parts}
+        return _masked(entry, self.number(self._inputs["opacity"]))
 
     def _turned(self, bsdf: SceneNode, *, is_diffuse: bool = True) -> SceneNode:
         """A BSDF with the normal map, if there is one.
@@ -175,13 +219,8 @@ class _Surface:
         normals = self._textures.normals(normal) if isinstance(normal, (TextureContents, NodeContents)) else None
         if normals is None:
             return bsdf
-        return {
-            "type": "normalmap",
-            "normalmap": normals,
-            "use_shadowing_function": is_diffuse,
-            "flip_invalid_normals": True,
-            "bsdf": bsdf,
-        }
+        shading = {"use_shadowing_function": is_diffuse, "flip_invalid_normals": True}
+        return {"type": "normalmap", "normalmap": normals, **shading, "bsdf": bsdf}
 
     def _opaque(self) -> SceneNode:
         if not self._is("translucency", 0):
@@ -200,9 +239,9 @@ class _Surface:
         entry: SceneNode = {
             "type": "principled",
             "base_color": self._color(inputs["base_color"]),
-            "roughness": self._number(inputs["roughness"]),
+            "roughness": self.number(inputs["roughness"]),
             "eta": max(self._eta(), _LEAST_ETA),
-            "metallic": self._number(inputs["metalness"]),
+            "metallic": self.number(inputs["metalness"]),
         }
         if not (self._is("metalness", 0) or has_white_edges(inputs["base_color"], inputs["edge_color"])):
             self._leave("edge colours of metals with textures, coats or other layers are ignored; the edges are white")
@@ -210,15 +249,15 @@ class _Surface:
         if ratio is not None:
             # The ratio of its widths is 1 - 0.9 anisotropic.
             rest = node("invert", "float", in_=ratio, amount=1.0)
-            entry["anisotropic"] = self._number(number("divide", rest, 0.9))
+            entry["anisotropic"] = self.number(number("divide", rest, 0.9))
         if not self._is("coat", 0):
             factor = self._reflectance("coat_ior") / _COAT
-            entry["clearcoat"] = self._number(number("multiply", inputs["coat"], factor))
+            entry["clearcoat"] = self.number(number("multiply", inputs["coat"], factor))
             entry["clearcoat_gloss"] = self._gloss()
         if not self._is("sheen", 0):
             color = np.broadcast_to(self._mean("sheen_color"), (3,))
             brightness = float(color @ LUMINANCE)
-            entry["sheen"] = self._number(number("multiply", inputs["sheen"], brightness))
+            entry["sheen"] = self.number(number("multiply", inputs["sheen"], brightness))
             if np.ptp(color) > 0:
                 self._leave("colours of sheen only set its brightness; it is white")
         return entry
@@ -230,7 +269,7 @@ class _Surface:
             self._leave(f"coats rougher than {_DULL**0.5:.2f} are rendered with that roughness")
         width = number("multiply", roughness, roughness)
         gloss = node("divide", "float", in1=node("invert", "float", in_=width, amount=_DULL), in2=_DULL - _GLOSSY)
-        return self._number(node("clamp", "float", in_=gloss, low=0.0, high=1.0))
+        return self.number(node("clamp", "float", in_=gloss, low=0.0, high=1.0))
 
     def _metal(self) -> SceneNode:
         n, k = conductor(constant(self._inputs["base_color"], 3), self._mean("edge_color"))
@@ -255,35 +294,32 @@ class _Surface:
         return {"type": "roughdielectric", "distribution": "ggx", **entry, **widths}
 
     def _sheet(self, transmission: float) -> SceneNode:
-        """A sheet both sides of which are outside."""
+        """A thin-walled BSDF."""
         inputs = self._inputs
         if transmission == 1 and self._widths() is None:
-            return {
-                "type": "thindielectric",
-                "int_ior": self._eta(),
-                "ext_ior": 1.0,
-                "specular_transmittance": self._color(inputs["transmission_color"]),
-            }
+            color = self._color(inputs["transmission_color"])
+            indices = {"int_ior": self._eta(), "ext_ior": 1.0}
+            return {"type": "thindielectric", **indices, "specular_transmittance": color}
         entry: SceneNode = {
             "type": "principledthin",
             "base_color": self._color(inputs["transmission_color" if transmission == 1 else "base_color"]),
-            "roughness": self._number(inputs["roughness"]),
+            "roughness": self.number(inputs["roughness"]),
             "eta": self._eta(),
             "spec_trans": transmission,
         }
         if transmission < 1:
-            entry["diff_trans"] = self._number(number("multiply", inputs["translucency"], 2.0))
+            entry["diff_trans"] = self.number(number("multiply", inputs["translucency"], 2.0))
         return entry
 
     def _reflectance(self, name: str) -> float:
-        """What an index of refraction reflects head-on."""
+        """Reflectance of an index of refraction at normal incidence."""
         eta = max(_first(self._mean(name)), 0.0)
         if not is_constant(self._inputs[name]):
             self._leave("textures of indices of refraction are replaced by their means")
         return ((eta - 1) / (eta + 1)) ** 2
 
     def _eta(self) -> float:
-        """Index of refraction of what reflects as much head-on: white, from outside."""
+        """Index of refraction of the specular layer, from outside; its colour counts by its brightness."""
         color = np.broadcast_to(self._mean("specular_color"), (3,))
         if np.ptp(color) > 0 and not self._is("metalness", 1):
             self._leave("specularColor and specular_color only set the brightness of reflections, which are white")
@@ -313,10 +349,10 @@ class _Surface:
         width = number("max", width, _MIRROR)
         ratio = self._ratio()
         if ratio is None:
-            return {"alpha": self._number(width)}
+            return {"alpha": self.number(width)}
         root = number("power", ratio, 0.5)
         u, v = (number("min", number(category, width, root), 1.0) for category in ("divide", "multiply"))
-        return {"alpha_u": self._number(u), "alpha_v": self._number(v)}
+        return {"alpha_u": self.number(u), "alpha_v": self.number(v)}
 
 
 def _clamped(given: Input) -> Input:
@@ -346,5 +382,4 @@ def _both_sides(entry: SceneNode) -> SceneNode:
 
 
 def _masked(entry: SceneNode, opacity: SceneNode | float) -> SceneNode:
-    """A BSDF with an opacity."""
     return entry if opacity == 1 else {"type": "mask", "opacity": opacity, "bsdf": entry}

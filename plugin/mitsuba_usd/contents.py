@@ -18,6 +18,22 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
+class NodeContents:
+    """A node of a shading network: what MaterialX computes of its inputs, or a plugin of Mitsuba."""
+
+    category: str  # Such as "multiply", see `materialx_nodes.OPERATIONS`; or the name of a plugin
+    type: str  # Of its output: "float", "color3", "vector2" and so on; "mitsuba" for plugins
+    # All its inputs except geometric ones. A string is an option. The category "texcoord" has the name of a primvar,
+    # and the fallback where a mesh lacks it; without a fallback, others of the mesh serve as well.
+    inputs: dict[str, Input]
+
+    @property
+    def is_plugin(self) -> bool:
+        """Whether it is a plugin of Mitsuba."""
+        return self.type == "mitsuba"
+
+
+@dataclass(frozen=True, eq=False)
 class TextureContents:
     """An image that an input of a material reads, ``scale * image + bias``."""
 
@@ -29,7 +45,7 @@ class TextureContents:
     bias: list[float] = field(default_factory=lambda: [0.0] * 4)
     # (3, 3) float64: from texture coordinates to those of the picture, whose v points up
     to_uv: NDArray = field(default_factory=lambda: np.eye(3))
-    texcoords: str = "st"  # Name of the primvar that has the texture coordinates
+    texcoords: NodeContents = field(default_factory=lambda: NodeContents("texcoord", "vector2", {"name": "st"}))
     fallback: list[float] = field(default_factory=lambda: [0.0] * 4)  # Where there is no such file
 
     @property
@@ -46,15 +62,8 @@ class PrimvarContents:
     fallback: list[float]
 
 
-@dataclass(frozen=True, eq=False)
-class NodeContents:
-    """A node of a shading network: what MaterialX computes of its inputs."""
-
-    category: str  # Such as "multiply"; see `materialx_nodes.OPERATIONS`
-    type: str  # Of its output: "float", "color3", "vector2" and so on
-    # All that the category has, but for those of the surface itself, such as its normal. A string is an option; that of
-    # the category "texcoord" names the primvar.
-    inputs: dict[str, Input]
+class MaterialError(ValueError):
+    """A material that cannot be read, with the reason."""
 
 
 Part = TypeVar("Part", "ShapeContents", "LightContents")
@@ -82,10 +91,11 @@ def leaves(given: Input) -> list[Source]:
 
 @dataclass(frozen=True, eq=False)
 class MaterialContents:
-    """What a surface looks like, in the terms that all models of surfaces share."""
+    """A material, in the terms that all models of surfaces share, or as a BSDF of Mitsuba."""
 
     name: str  # Path of the prim
-    inputs: dict[str, Input]  # By the names of `surface_models.NEUTRAL`, those that are not neutral
+    # By names of `surface_models.NEUTRAL`, without defaults, or "bsdf"; and "displacement" and its scale, in its units
+    inputs: dict[str, Input]
 
     @property
     def is_emissive(self) -> bool:
@@ -103,13 +113,10 @@ class MaterialContents:
         """Names of the attributes that it reads."""
         return {leaf.name for leaf in self._leaves() if isinstance(leaf, PrimvarContents)}
 
-    def texcoords(self) -> list[str]:
-        """Names of the texture coordinates that it reads, each once."""
-        names: dict[str, None] = {}
-        for leaf in self._leaves():
-            if not isinstance(leaf, PrimvarContents):
-                names[str(leaf.inputs["name"]) if isinstance(leaf, NodeContents) else leaf.texcoords] = None
-        return list(names)
+    def texcoords(self) -> dict[str, Input | None]:
+        """Names of the texture coordinates that it reads, with their fallbacks."""
+        sets = (leaf.texcoords if isinstance(leaf, TextureContents) else leaf for leaf in self._leaves())
+        return {str(s.inputs["name"]): s.inputs.get("fallback") for s in sets if isinstance(s, NodeContents)}
 
     def _leaves(self) -> Iterator[Source]:
         return (leaf for given in self.inputs.values() for leaf in leaves(given))
@@ -126,10 +133,17 @@ class ShapeContents:
     material: MaterialContents | None = None  # Those that are equal are one
     constants: dict[str, list[float]] = field(default_factory=dict)  # Attributes with one value for the whole mesh
     radiance: list[float] | None = None  # Three numbers, if the mesh is a light
+    is_normalized: bool = False  # Whether the radiance is that of the whole light, to be divided by its area
     # (n,) int: faces with this material, of a limit surface that is evaluated whole; None for all. Parts of polygon
     # meshes and of large surfaces have the other faces as holes.
     shown_faces: NDArray | None = None
     curves: CurveSet | None = None  # In the prim's own space; then the cage has their points in USD, and no faces
+    rate: int | None = None  # Segments on each edge, where the stage says
+
+    @property
+    def is_displaced(self) -> bool:
+        """Whether it is a limit surface whose material displaces it."""
+        return self.cage.scheme is not None and self.material is not None and "displacement" in self.material.inputs
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,10 @@ def with_large_copies(contents: SceneContents) -> SceneContents:
         return contents
     sizes = [[len(shape.cage.face_sizes) for shape in group] for group in contents.groups]
     is_large = [bool(group) and sum(group) >= LARGE * len(group) for group in sizes]
+    # Heights are in the space of each copy, and one mesh of all copies has one.
+    is_large = [
+        a or any(shape.is_displaced for shape in group) for a, group in zip(is_large, contents.groups, strict=True)
+    ]
     copies = [
         instance.placed(shape)
         for instance in contents.instances
@@ -63,7 +67,8 @@ def with_copies(
 
     If all would take more than `MOST_BYTES`, the highest rate gives way, down to the lowest; or else instances stay.
     """
-    are_many = len(contents.instances) >= LEAST_INSTANCES
+    is_displaced = any(shape.is_displaced for group in contents.groups for shape in group)
+    are_many = len(contents.instances) >= LEAST_INSTANCES and not is_displaced
     of_group: dict[int, list[NDArray[np.float64]]] = {}
     for instance in contents.instances if are_many else []:
         of_group.setdefault(instance.group, []).append(instance.to_world)
@@ -76,7 +81,7 @@ def with_copies(
             needed[shape] = rates.get(shape, np.ones(len(matrices), np.int64))
     of_cage: dict[tuple[int, int], list[ShapeContents]] = {}
     for shape in contents.shapes:
-        if len(shape.cage.face_sizes) < LARGE:
+        if len(shape.cage.face_sizes) < LARGE and not shape.is_displaced:
             of_cage.setdefault((id(shape.cage), id(shape.shown_faces)), []).append(shape)
     together: set[ShapeContents] = set()
     for alike in of_cage.values():
@@ -160,7 +165,6 @@ def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> S
 
 
 def _attribute(given: Attribute, corners: IntArray) -> Attribute:
-    """An attribute of all copies, with the face corners ``(n, n_h)``."""
     if given.interpolation != "face_varying":
         return Attribute(np.tile(given.values, (len(corners), 1)), given.interpolation)
     indices = np.arange(len(given.values)) if given.indices is None else given.indices

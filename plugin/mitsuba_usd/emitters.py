@@ -41,7 +41,6 @@ def _distant(light: LightContents) -> SceneNode:
 
 
 def _flat(light: LightContents, textures: Textures) -> SceneNode:
-    """A rectangle or a disk."""
     is_rect = light.kind == "rect"
     u, v = np.array(light.size) / 2 if is_rect else np.repeat(light.size, 2)
     area = _area(light, (4 if is_rect else math.pi) * u * v * _stretch(light.to_world, 0, 1))
@@ -142,7 +141,6 @@ def _bounding_radius(light: LightContents) -> float:
 
 
 def _area(light: LightContents, area: float) -> SceneNode:
-    """Emitter of a shape with an area."""
     radiance = np.array(light.emission) / (area if light.is_normalized and area > 0 else 1)
     return {"type": "area", "radiance": rgb(radiance)}
 

@@ -122,8 +122,6 @@ def _beside(path: str, document: str) -> str:
 
 
 class _Material:
-    """Makes the prims of a material."""
-
     def __init__(self, stage: Usd.Stage, node: MaterialX.Node, document: str) -> None:
         import MaterialX
 
@@ -152,7 +150,6 @@ class _Material:
     def _add_graph(
         self, graph: Any, path: Sdf.Path, inputs: Iterable[MaterialX.Input], parent: Sdf.Path, container: Any
     ) -> None:
-        """Add a graph with inputs, all its nodes, and its outputs."""
         connectable = UsdShade.NodeGraph.Define(self._stage, path).ConnectableAPI()
         for port in inputs:
             self._add_input(connectable, port, parent, container)
@@ -186,7 +183,6 @@ class _Material:
         return path
 
     def _add_input(self, connectable: Any, given: MaterialX.Input, parent: Sdf.Path, container: Any) -> Any:
-        """Add an input with its value or connection."""
         port = connectable.CreateInput(_prim_name(given.getName()), _sdf_type(given.getType()))
         if not self._connect(port.GetAttr(), given, parent, container):
             self._set(port.GetAttr(), given)

@@ -1,8 +1,8 @@
 """Nodes of MaterialX: what they compute, and expressions of them, with what is constant computed at once.
 
-Values are arrays ``(..., k)`` with the channels of a type last. What a category computes is what the library of
-MaterialX 1.39 says in its shaders (``libraries/stdlib/genglsl``); categories that the library builds of others are not
-here. Noises, of points ``(..., 2)``, are those of Open Shading Language (``oslnoise.h``).
+Values are arrays ``(..., k)`` with the channels of a type last. Nodes compute what the shaders of MaterialX 1.39 do
+(``libraries/stdlib/genglsl``); its node graphs are expanded elsewhere. Noises of points ``(..., 2)`` are those of Open
+Shading Language (``oslnoise.h``).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from mitsuba_subdivision.cage import same
 from numpy.typing import NDArray
 
-from .contents import Input, NodeContents, PrimvarContents, TextureContents
+from .contents import Input, MaterialError, NodeContents, PrimvarContents, TextureContents, parts
 
 Values = NDArray[np.floating]
 Hash = NDArray[np.uint32]
@@ -26,9 +26,9 @@ CHANNELS = {
 }  # fmt: skip
 # Luminance of linear Rec. 709.
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-# Makes Perlin noise be from -1 to 1 about.
+# Scales Perlin noise to about -1 to 1.
 _PERLIN_SCALE = 0.6616
-# Where the last components of noises are taken from, of single ones and of sums.
+# Offsets of the last components of noises, single ones and sums.
 _ELSEWHERE, _ELSEWHERE_IN_SUMS = np.array([19.0, 73.0]), np.array([19.0, 193.0])
 
 # Values (..., k) of a picture at texture coordinates (..., 2), or for None at the points of an evaluation.
@@ -80,12 +80,15 @@ def evaluate(
 
 
 def operation(category: str, kind: str, inputs: Mapping[str, Any]) -> Values:
-    """What a category computes of values; ``kind`` is the type of its output."""
+    """Values of a node whose output has the type ``kind``. Raises MaterialError for inputs of other types."""
     named = {"in_" if name == "in" else name: value for name, value in inputs.items()}
     arguments = SimpleNamespace(**{**named, "kind": kind, "width": CHANNELS[kind]})
-    with np.errstate(all="ignore"):
-        values = np.asarray(OPERATIONS[category](arguments))
-    # As shaders do, which have no way to say that there is no number.
+    try:
+        with np.errstate(all="ignore"):
+            values = np.asarray(OPERATIONS[category](arguments))
+    except (IndexError, ValueError):
+        raise MaterialError(f"{category} of {', '.join(inputs)} of other types") from None
+    # Shaders have no NaN.
     return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
 
 
@@ -104,7 +107,7 @@ def _stacked(values: tuple[Values, ...]) -> Values:
 
 
 def _converted(n: SimpleNamespace) -> Values:
-    """Of another width: repeated, cut off, or with an alpha of 1, or with zeros."""
+    """Values of another width: repeated, truncated, or extended by an alpha of 1 or zeros."""
     values, width = n.in_, n.width
     if values.shape[-1] == 1:
         values = np.broadcast_to(values, (*values.shape[:-1], 3 if n.kind == "color4" else width))
@@ -162,7 +165,6 @@ def _hsv(values: Values) -> Values:
 
 
 def _rgb(values: Values) -> Values:
-    """Colours of hue, saturation and value."""
     hue, saturation, value = np.moveaxis(values[..., :3], -1, 0)
     offset = np.stack([(5 + 6 * hue) % 6, (3 + 6 * hue) % 6, (1 + 6 * hue) % 6], axis=-1)
     ramp = np.clip(np.minimum(offset, 4 - offset), 0, 1)
@@ -170,7 +172,7 @@ def _rgb(values: Values) -> Values:
 
 
 def _blended(blend: Callable[[Values, Values], Values]) -> Callable[[SimpleNamespace], Values]:
-    """Of a foreground and a background, mixed with the background."""
+    """Blend of foreground and background, mixed with the background."""
     return lambda n: _mixed(n.bg, blend(n.fg, n.bg), n.mix)
 
 
@@ -204,7 +206,6 @@ def _perlin(points: Values, width: int) -> Values:
 
 
 def _fractal(points: Values, n: SimpleNamespace, width: int) -> Values:
-    """Sum of Perlin noises, each finer and weaker than the one before."""
     if width in (2, 4):
         return _stacked((_fractal(points, n, width - 1), _fractal(points + _ELSEWHERE_IN_SUMS, n, 1)))
     total = np.zeros((*points.shape[:-1], width))
@@ -336,8 +337,26 @@ OPERATIONS: dict[str, Callable[[SimpleNamespace], Values]] = {
     "worleynoise2d": _worley,
     "roughness_anisotropy": _roughness,
 }
-# That read texture coordinates or pictures themselves.
+# Sets of inputs in which an operation is affine per channel while its other inputs are constant.
+AFFINE: dict[str, tuple[set[str], ...]] = {
+    **dict.fromkeys(("add", "subtract", "combine2", "combine3", "combine4"), ({"in1", "in2", "in3", "in4"},)),
+    **dict.fromkeys(("ifgreater", "ifgreatereq", "ifequal"), ({"in1", "in2"},)),
+    **dict.fromkeys(("constant", "dot", "extract", "convert", "rotate2d"), ({"in", "value"},)),
+    **dict.fromkeys(("mix", "plus", "minus"), ({"bg", "fg"}, {"mix"})),
+    **dict.fromkeys(("screen", "over", "in", "mask", "out"), ({"fg"}, {"bg"}, {"mix"})),
+    **dict.fromkeys(("inside", "outside"), ({"in"}, {"mask"})),
+    "invert": ({"in", "amount"},),
+    "multiply": ({"in1"}, {"in2"}),
+    "divide": ({"in1"},),
+    "remap": ({"in"}, {"outlow", "outhigh"}),
+}
+# Categories that read texture coordinates or images.
 SAMPLED = ("texcoord", "image", "heighttonormal")
+
+
+def is_affine(category: str, varying: set[str]) -> bool:
+    """Whether an operation is affine in inputs that vary."""
+    return any(varying <= names for names in AFFINE.get(category, ()))
 
 
 def node(category: str, kind: str, **inputs: Input) -> Input:
@@ -346,10 +365,10 @@ def node(category: str, kind: str, **inputs: Input) -> Input:
 
 
 def node_of(category: str, kind: str, given: dict[str, Input]) -> Input:
-    """An expression: a node of a type, or what it comes to.
+    """A node of a type, simplified.
 
-    What has only constant inputs is computed, what changes nothing is left out, and a picture whose channels are
-    chosen, scaled and moved by constants stays a picture.
+    Constants are folded, nodes without effect are left out, and an image whose channels are selected, scaled and offset
+    by constants stays an image.
     """
     if category in SAMPLED:
         return NodeContents(category, kind, given)
@@ -362,16 +381,27 @@ def node_of(category: str, kind: str, given: dict[str, Input]) -> Input:
     return NodeContents(category, kind, given) if simpler is None else simpler
 
 
+def width_of(given: Input) -> int:
+    """How many numbers an input has."""
+    if isinstance(given, NodeContents):
+        return CHANNELS.get(given.type, 1)
+    if isinstance(given, (TextureContents, PrimvarContents)):
+        return len(given.channels if isinstance(given, TextureContents) else given.fallback)
+    return len(given) if isinstance(given, list) else 1
+
+
 def is_constant(given: Input) -> bool:
     """Whether an input is a number, a colour or an option."""
     return isinstance(given, (int, float, list, str))
 
 
 def constant(given: Input, width: int | None = None) -> NDArray[np.float64]:
-    """Numbers ``(k,)`` of a constant input, maybe repeated to a width. Raises TypeError, ValueError for others."""
-    if not isinstance(given, (int, float, list)):
-        raise TypeError(f"{given!r} is no number; expected one, or a colour")
-    numbers = np.atleast_1d(np.asarray(given, dtype=np.float64))
+    """Numbers ``(k,)`` of a constant input, maybe repeated to a width. Raises MaterialError for others."""
+    numbers = (
+        np.atleast_1d(np.asarray(given, dtype=np.float64)) if isinstance(given, (int, float, list)) else np.zeros(0)
+    )
+    if not numbers.size or (width is not None and numbers.size not in (1, width)):
+        raise MaterialError(f"{given!r} is not {width or 'one'} number{'s' * (width not in (None, 1))}")
     return numbers if width is None else np.broadcast_to(numbers, (width,))
 
 
@@ -381,7 +411,7 @@ def is_all(given: Input, value: float) -> bool:
 
 
 def _without_effect(category: str, kind: str, given: dict[str, Input]) -> Input | None:
-    """The input that a node comes to; None if it changes its inputs."""
+    """The input that a node passes through unchanged; None if it changes its inputs."""
     chosen: Input | None = None
     if category in ("constant", "dot"):
         return given["value" if category == "constant" else "in"]
@@ -409,40 +439,33 @@ def _without_effect(category: str, kind: str, given: dict[str, Input]) -> Input 
 _COMPARED: dict[str, Callable[[float, float], bool]] = {
     "ifgreater": operator.gt, "ifgreatereq": operator.ge, "ifequal": operator.eq,
 }  # fmt: skip
-# Colours by which a node of pictures is tried out: black, the four channels, and others, within 0 to 1 and beyond.
-_random = np.random.default_rng(0)
-_TRIED_COLORS = np.vstack([np.zeros(4), np.eye(4), _random.random((8, 4)), _random.uniform(-20, 20, (8, 4))])
+_VARYING = frozenset({"channel", "scale", "bias", "fallback"})
+# Channels of an image and a constant, by which affine functions are known: black, and each channel alone.
+_BASIS = np.vstack([np.zeros(4), np.eye(4)])
 
 
 def _picture(category: str, kind: str, given: dict[str, Input]) -> TextureContents | None:
-    """The picture that a node of one picture comes to: one each of whose channels is a scaled and moved one of it.
+    """If the node is affine per channel in one image, that image with a new scale and bias; else None.
 
-    None if it is no such node. Channels of the picture may be inputs of their own.
+    Channels of the image may be inputs of their own.
     """
-    pictures = [value for value in given.values() if isinstance(value, TextureContents)]
-    varying = frozenset({"channel", "scale", "bias", "fallback"})
-    if not all(isinstance(value, TextureContents) or is_constant(value) for value in given.values()):
+    pictures = {name: value for name, value in given.items() if isinstance(value, TextureContents)}
+    first = next(iter(pictures.values()), None)
+    if first is None or not all(name in pictures or is_constant(value) for name, value in given.items()):
         return None
-    if not all(same(picture, pictures[0], varying) for picture in pictures):
+    if not is_affine(category, set(pictures)) or not all(same(one, first, _VARYING) for one in pictures.values()):
         return None
 
-    def tried(value: Input) -> Any:
+    def on_basis(value: Input) -> Any:
         if isinstance(value, TextureContents):
-            return np.vstack([_TRIED_COLORS * value.scale + value.bias, value.fallback])[:, value.channels]
+            return np.vstack([_BASIS * value.scale + value.bias, value.fallback])[:, value.channels]
         return value if isinstance(value, str) else constant(value)
 
-    try:
-        values = operation(category, kind, {name: tried(value) for name, value in given.items()})
-    except (IndexError, ValueError):
-        return None
-    if values.ndim != 2 or not values.shape[1]:
-        return None
+    values = operation(category, kind, {name: on_basis(value) for name, value in given.items()})
     bias, slopes, columns = values[0], values[1:5] - values[0], np.arange(values.shape[1])
     channels = np.abs(slopes).argmax(axis=0)
     factor = slopes[channels, columns]
-    expected = _TRIED_COLORS[:, channels] * factor + bias
-    # What is constant for all that is tried may be a step beyond.
-    if not factor.all() or not np.allclose(values[:-1], expected, rtol=1e-9, atol=1e-12):
+    if (np.count_nonzero(slopes, axis=0) != 1).any():
         return None
     if np.ptp(np.vstack([channels, values]), axis=1).max() == 0:
         # One channel serves as a colour.
@@ -450,10 +473,25 @@ def _picture(category: str, kind: str, given: dict[str, Input]) -> TextureConten
     channel = "".join("rgba"[index] for index in channels)
     if channel not in ("r", "g", "b", "a", "rg", "rgb", "rgba"):
         return None
-    numbers = np.array([pictures[0].scale, pictures[0].bias, pictures[0].fallback])
+    numbers = np.array([first.scale, first.bias, first.fallback])
     numbers[:, channels] = np.stack([factor, bias, values[-1]])[:, columns]
     scale, bias, fallback = numbers.tolist()
-    return replace(pictures[0], channel=channel, scale=scale, bias=bias, fallback=fallback)
+    return replace(first, channel=channel, scale=scale, bias=bias, fallback=fallback)
+
+
+def affine_map(given: Input) -> NDArray[np.float64] | None:
+    """Matrix ``(3, 3)`` of an expression of texture coordinates if all its nodes are affine; else None."""
+    for part in parts(given):
+        if not isinstance(part, NodeContents):
+            return None
+        varying = {name for name, value in part.inputs.items() if not is_constant(value)}
+        if part.category != "texcoord" and not is_affine(part.category, varying):
+            return None
+    origin, u, v = np.broadcast_to(evaluate(given, _CORNERS), (3, 2)).astype(np.float64)
+    return np.vstack([np.stack([u - origin, v - origin, origin], axis=1), [0, 0, 1]])
+
+
+_CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 
 
 def _plain(values: Values) -> float | list[float]:

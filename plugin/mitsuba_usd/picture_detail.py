@@ -22,8 +22,10 @@ from .textures import samples_elsewhere
 
 # Texels for each pixel: filters see details of half a pixel, and glass magnifies.
 TEXELS_PER_PIXEL = 2.0
-# Edges of a mesh that count: a few may have collapsed in the texture. Of these, so many are measured.
-_MOST_EDGES, _MOST_SAMPLES = 0.95, 20_000
+# Parts of the edges of a mesh, as a few may have collapsed in the texture, and of texels; and edges that are measured.
+_MOST_EDGES, _MOST_TEXELS, _MOST_SAMPLES = 0.95, 0.99, 20_000
+# Outlines of sensors and the distances of their near planes; see `outline_for`.
+Views = Sequence[tuple[SceneNode, float]]
 
 
 def with_rate(parameters: dict[str, Any], contents: SceneContents) -> dict[str, Any]:
@@ -57,13 +59,13 @@ def triangles_for_picture(
     most = parameters["tessellation_rate"]
     needed = {shape: int(segments[shape].max()) for shape in contents.all_shapes if shape in segments}
     chosen: dict[ShapeContents, dict[str, Any]] = {
-        shape: {"tessellation_rate": min(rate, most)} for shape, rate in needed.items()
+        shape: {"tessellation_rate": rate if shape.is_displaced else min(rate, most)} for shape, rate in needed.items()
     }
     if needed and parameters["shading"] == "exact" and follows_sensor and "displacement" not in parameters:
         corners = {shape: int(shape.cage.face_sizes.sum()) for shape in needed}
         highest = studio.highest_rate(np.array([*needed.values()]), np.array([*corners.values()]))
         for shape in contents.shapes:
-            if shape in needed:
+            if shape in needed and not shape.is_displaced:
                 chosen[shape] = studio.triangles_for(needed[shape], corners[shape], most, outline, highest)
     return chosen
 
@@ -95,7 +97,7 @@ def segments_of(
 def texels_for_pictures(contents: SceneContents, sensors: Sequence[SceneNode]) -> dict[str, float]:
     """Pixels along the sides of textures that pictures by sensors show at most, by file; of tiles, along those of each.
 
-    Files of which the detail is unknown are missing, or have no bound.
+    Files of unknown detail are missing, or infinite.
     """
     seen = [(studio.outline_for(sensor), sensor["near_clip"]) for sensor in sensors]
     matrices: dict[ShapeContents, list[NDArray[np.float64]]] = {}
@@ -117,30 +119,50 @@ def texels_for_pictures(contents: SceneContents, sensors: Sequence[SceneNode]) -
     return needed
 
 
-def _pixels_of_texcoords(
-    cage: CageContents,
-    to_world: NDArray[np.float64],  # (n, 4, 4): of copies
-    seen: Sequence[tuple[SceneNode, float]],
-) -> float:
-    """Pixels that a unit of texture coordinates takes at most, for most edges of copies of a mesh; else no bound."""
-    texcoords = cage.texcoords
-    if texcoords is None:
-        return np.inf
-    corners = np.arange(0, len(cage.face_vertices), 1 + len(cage.face_vertices) // _MOST_SAMPLES)
-    topology = Topology(len(cage.positions), cage.face_sizes, cage.face_vertices)
-    ends = np.stack([corners, topology.next[corners]])
-    vertices = topology.face_vertices[ends]
-    index = vertices if texcoords.indices is None else np.asarray(texcoords.indices)[ends]
-    lengths, in_texture = (
-        np.linalg.norm(np.diff(np.asarray(values, dtype=np.float64)[rows], axis=0)[0], axis=1)
-        for values, rows in ((cage.positions, vertices), (texcoords.values, index))
-    )
+def _pixels_of_texcoords(cage: CageContents, to_world: NDArray[np.float64], seen: Views) -> float:
+    """Maximum pixels of a unit of texture coordinates, for most edges of copies ``(n, 4, 4)``; infinite if unknown."""
+    lengths, in_texture = (np.linalg.norm(vectors, axis=1) for vectors in _edges(cage))
     there = in_texture > 0
     if not there.any():
         return np.inf
+    return pixels_of(cage, to_world, seen) * float(np.quantile(lengths[there] / in_texture[there], _MOST_EDGES))
+
+
+def _edges(cage: CageContents) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Vectors of some edges ``(n, 3)``, and in texture coordinates ``(n, 2)``; none without texture coordinates."""
+    if cage.texcoords is None:
+        return np.zeros((0, 3)), np.zeros((0, 2))
+    corners = np.arange(0, len(cage.face_vertices), 1 + len(cage.face_vertices) // _MOST_SAMPLES)
+    topology = Topology(len(cage.positions), cage.face_sizes, cage.face_vertices)
+    ends = np.stack([corners, topology.next[corners]])
+    vertices, indices = topology.face_vertices[ends], cage.texcoords.indices
+    index = vertices if indices is None else np.asarray(indices)[ends]
+    along, in_texture = (
+        np.diff(np.asarray(values, dtype=np.float64)[rows], axis=0)[0]
+        for values, rows in ((cage.positions, vertices), (cage.texcoords.values, index))
+    )
+    return along, in_texture
+
+
+def pixels_of(cage: CageContents, to_world: NDArray[np.float64], seen: Views) -> float:
+    """Maximum pixels of a unit of a mesh, over its copies ``(n, 4, 4)`` and views."""
     box = np.stack([cage.positions.min(axis=0), cage.positions.max(axis=0)]).astype(np.float64)
     corners_of_copies = points_at(box_corners(box), to_world)
     pixels = np.max([studio.pixels_of_boxes(corners_of_copies, *view) for view in seen], axis=0)
-    stretch = np.linalg.norm(to_world[:, :3, :3], 2, axis=(1, 2))
-    ratio = float(np.quantile(lengths[there] / in_texture[there], _MOST_EDGES))
-    return ratio * float((stretch * pixels).max())
+    return float((np.linalg.norm(to_world[:, :3, :3], 2, axis=(1, 2)) * pixels).max())
+
+
+def rate_of_heights(cage: CageContents, texture: SceneNode, error: float) -> int:
+    """Segments on each edge with which chords are within an error of most heights of a bitmap of one channel."""
+    pixels = np.array(texture["bitmap"])
+    heights = pixels.reshape(pixels.shape[:2]) / (255.0 if pixels.dtype == np.uint8 else 1.0)
+    # In texels, powers of two.
+    length = 1
+    while 4 * length <= min(heights.shape):
+        away = [np.abs(h[2 * length :] + h[: -2 * length] - 2 * h[length:-length]) / 2 for h in (heights, heights.T)]
+        if max(np.quantile(part, _MOST_TEXELS) for part in away) > error:
+            break
+        length *= 2
+    to_texels = np.array(texture["to_uv"].matrix)[:2, :2] * np.array(heights.shape[::-1])[:, None]
+    texels = np.abs(_edges(cage)[1] @ to_texels.T).max(axis=1)
+    return max(1, math.ceil(float(np.quantile(texels, _MOST_EDGES)) / length))

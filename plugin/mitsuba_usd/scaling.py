@@ -35,7 +35,9 @@ def scaled(contents: SceneContents, factor: float) -> SceneContents:
         return materials.get(material, material)
 
     def of_shape(shape: ShapeContents, matrix: np.ndarray) -> ShapeContents:
-        return replace(shape, to_world=matrix @ shape.to_world, material=of_material(shape.material))
+        power = factor**2 if shape.is_normalized else 1.0
+        radiance = None if shape.radiance is None else [power * channel for channel in shape.radiance]
+        return replace(shape, to_world=matrix @ shape.to_world, material=of_material(shape.material), radiance=radiance)
 
     def of_light(light: LightContents) -> LightContents:
         # What is given for a whole lamp is divided by its area, or by the square of the distance.

@@ -80,6 +80,8 @@ def scene_entries(
             if shape.curves is not None:
                 return shape.curves.placed(shape.to_world[None]).entry(shape.cage.attributes, with_bsdf)
             if shape.cage.scheme is None:
+                if material is not None and "displacement" in material.inputs:
+                    notes.add("displacement of meshes that are not subdivided is ignored", shape.name)
                 return {**polygon_mesh(shape).entry(with_bsdf, area), **interior(material)}
             return subdivision(shape, surfaces, with_bsdf, area, {**of_shape, **interior(material)}, notes)
 
@@ -94,17 +96,17 @@ def scene_entries(
 
     def shown(shape: ShapeContents) -> SceneNode | mi.Object | None:
         """A shape; None if it cannot be used, with a warning."""
-        shining = None if shape.radiance is None else rgb(shape.radiance)
-        if shining is None and shape.material is not None:
-            shining = radiance(shape.material, textures, notes)
-        if shining is not None and shape.curves is not None:
-            notes.add("emission of curves is ignored; Mitsuba's curves are no lights", shape.name)
-        area = None if shining is None else {"type": "area", "radiance": shining}
         try:
+            shining = None if shape.radiance is None else rgb(np.array(shape.radiance) / _light_area(shape))
+            if shining is None and shape.material is not None:
+                shining = radiance(shape.material, textures, notes)
+            if shining is not None and shape.curves is not None:
+                notes.add("emission of curves is ignored; Mitsuba's curves are no lights", shape.name)
+            area = None if shining is None else {"type": "area", "radiance": shining}
             return made(shape, area)
         except SchemeError as error:
             notes.add_message(f"{error}; the mesh is shown as polygons", shape.name)
-            return made(as_polygons(shape), area)
+            return shown(as_polygons(shape))
         except CageError as error:
             notes.add_message(f"{error}; the prim is left out", shape.name)
             return None
@@ -154,7 +156,6 @@ class CachedSurface:
 
     @cached_property
     def _used(self) -> NDArray[np.bool_]:
-        """Mask of the vertices of faces that are not holes."""
         cage = self.surface.cage
         is_hole = np.isin(np.arange(cage.face_count), cage.holes)
         return np.isin(np.arange(cage.vertex_count), cage.face_vertices[np.repeat(~is_hole, cage.face_sizes)])
@@ -233,6 +234,18 @@ def subdivision(
         "bsdf": bsdf,
         **({} if emitter is None else {"emitter": emitter}),
     }
+
+
+def _light_area(shape: ShapeContents) -> float:
+    """Area of a normalized light in the world, with all its faces; 1 for others."""
+    if not shape.is_normalized:
+        return 1.0
+    cage = replace(shape.cage, positions=points_at(np.asarray(shape.cage.positions, np.float64), shape.to_world))
+    if cage.scheme is not None:
+        return LimitSurface(ControlCage.from_arrays(**cage.as_arguments())).area()
+    corners, face = triangle_corners(cage.positions, cage.face_sizes, cage.face_vertices)
+    p = cage.positions[cage.face_vertices[corners[~np.isin(face, cage.holes)]]]
+    return float(np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1).sum() / 2) or 1.0
 
 
 def as_polygons(shape: ShapeContents) -> ShapeContents:

@@ -16,9 +16,9 @@ from .emitters import are_lamps_in_the_way
 from .stage_warnings import StageWarnings
 
 _LEAST_NEAR = 1e-6
-# What a single scene leaves out of a camera.
+# Of single scenes.
 NO_BLUR = "shutters of cameras have no effect without the option --shutter of render"
-# Of pictures by a stage's camera.
+# Default width of pictures by a stage's camera, in pixels.
 WIDTH = 640
 RESERVED = ("integrator", "sensor", *STUDIO, ENVIRONMENT)
 # Minimum half-extent of the framed content, relative to its position.

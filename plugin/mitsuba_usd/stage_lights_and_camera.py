@@ -26,14 +26,15 @@ _KINDS: dict[str, tuple[str, ...]] = {
 # Angle in degrees, of the Sun and some more, up to which a distant light becomes a point without a warning.
 _POINTLIKE = 1.0
 _CONE = "inputs:shaping:cone:angle"
-# Attributes of lights that are ignored, and the values that have no effect.
+# Attributes of lights that are ignored, the values that have no effect, and why.
+_EVERYWHERE = "Mitsuba's area lights shine in all directions"
 _NEUTRAL_OF_LIGHTS = {
-    "inputs:diffuse": 1,
-    "inputs:specular": 1,
-    _CONE: 90,
-    "inputs:shaping:focus": 0,
-    "inputs:shaping:ies:file": None,
-    "inputs:shadow:enable": True,
+    "inputs:diffuse": (1, "lights illuminate all materials"),
+    "inputs:specular": (1, "lights illuminate all materials"),
+    _CONE: (90, _EVERYWHERE),
+    "inputs:shaping:focus": (0, _EVERYWHERE),
+    "inputs:shaping:ies:file": (None, "Mitsuba has no lights with IES profiles"),
+    "inputs:shadow:enable": (True, "all shapes cast shadows"),
 }
 _NEUTRAL_EXPOSURE = {"exposure": 0.0, "exposure:iso": 100.0}
 _NEUTRAL_EXPOSURE |= dict.fromkeys(("exposure:time", "exposure:fStop", "exposure:responsivity"), 1.0)
@@ -54,11 +55,15 @@ def read_light(
     size = [float(value_at(prim.GetAttribute(name), time)) for name in sizes]
     if kind == "distant" and size[0] > _POINTLIKE:
         notes.add("distant lights have an angle of 0, and sharp shadows; expected an angle of 1 degree or less", path)
-    is_point = bool(kind == "sphere" and _value(prim, "treatAsPoint", time, False))
+    is_normalized = bool(_value(prim, "inputs:normalize", time, False))
+    is_point = bool(kind == "sphere" and (size[0] == 0 or _value(prim, "treatAsPoint", time, False)))
     angle = float(_value(prim, _CONE, time, 90.0))
-    if kind == "sphere" and 0 <= angle < 90:
+    if kind == "sphere" and (angle == 0 or (size[0] == 0 and not is_normalized)):
+        notes.add("sphere lights without power are left out: of radius 0 and not normalized, or with a cone of 0", path)
+        return None
+    if kind == "sphere" and 0 < angle < 90:
         size += [angle, float(_value(prim, "inputs:shaping:cone:softness", time, 0.0))]
-        if not is_point and size[0] > 0:
+        if not is_point:
             notes.add("sphere lights with a cone have a radius of 0, and sharp shadows", path)
         kind = "spot"
     elif is_point:
@@ -71,7 +76,7 @@ def read_light(
         kind,
         to_world,
         read_emission(prim, time).tolist(),
-        bool(_value(prim, "inputs:normalize", time, False)),
+        is_normalized,
         size,
         _texture(prim, time, notes) if kind in ("rect", "dome") else None,
         str(pole).lower(),
@@ -98,13 +103,13 @@ def _value(prim: Usd.Prim, name: str, time: Usd.TimeCode, usual: Any) -> Any:
 
 
 def _note_ignored(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> None:
-    for name, neutral in _NEUTRAL_OF_LIGHTS.items():
+    if own := [attribute.GetName() for attribute in prim.GetAuthoredPropertiesInNamespace("mitsuba")]:
+        notes.add("attributes of Mitsuba are ignored at lights", f"{', '.join(own)} of {prim.GetPath()}")
+    for name, (neutral, reason) in _NEUTRAL_OF_LIGHTS.items():
         value = _value(prim, name, time, neutral)
         is_cone_kept = name == _CONE and (value >= neutral or prim.GetTypeName() == "SphereLight")
         if value != neutral and not is_cone_kept:
-            notes.add(
-                f"{name} of lights is ignored; lights illuminate all materials, in all directions", prim.GetPath()
-            )
+            notes.add(f"{name} of lights is ignored; {reason}", prim.GetPath())
     for name, what in (("light:filters", "light filters"), ("portals", "portals")):
         relationship = prim.GetRelationship(name)
         if relationship and relationship.GetTargets():

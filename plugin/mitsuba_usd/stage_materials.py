@@ -1,4 +1,4 @@
-"""Materials of a stage as plain data: networks of shaders of USD itself and of MaterialX, as expressions."""
+"""Materials of a stage as plain data: shading networks of USD, MaterialX and Mitsuba, as expressions."""
 
 from __future__ import annotations
 
@@ -10,46 +10,58 @@ import numpy as np
 from mitsuba_subdivision.cage import same
 from mitsuba_subdivision.files import value_at
 from mitsuba_subdivision.srgb import decoded
-from numpy.typing import NDArray
-from pxr import Usd, UsdShade
+from pxr import Sdf, Usd, UsdShade
 
+from . import materialx_nodes as nodes
 from . import surface_models
-from .contents import Input, MaterialContents, NodeContents, PrimvarContents, TextureContents, leaves
+from .contents import Input, MaterialContents, MaterialError, NodeContents, PrimvarContents, TextureContents, leaves
 from .materialx_layers import has_materialx, library, numbers
-from .materialx_nodes import CHANNELS, OPERATIONS, SAMPLED, constant, evaluate, is_all, is_constant, node, node_of
 from .stage_warnings import StageWarnings
 from .surface_models import LEFT_OUT, MODELS, PREVIEW
-from .texture_image import UDIM
+from .texture_image import UDIM, V_DOWN
 
 if TYPE_CHECKING:
     import MaterialX
 
 
 class _Port(NamedTuple):
-    """An input of a node, as its definition has it."""
-
     name: str
-    kind: str  # Type of MaterialX; of USD's nodes "asset" and "texcoord", or "" for numbers of any width
-    usual: Input | None = None  # Without a value or a connection; None for a vector of the surface
+    # Type of MaterialX. Of USD's nodes "asset", "texcoord", "string", or "" for numbers; "constant" for numbers that
+    # cannot be connected to shaders.
+    kind: str
+    default: Input | None = None  # None for a vector of the surface
+
+    @property
+    def width(self) -> int:
+        """How many numbers it has; 0 if that is not known."""
+        default = None if isinstance(self.default, str) else self.default
+        return nodes.CHANNELS.get(self.kind, 0 if default is None else nodes.width_of(default))
 
 
-def _texcoords(name: str) -> NodeContents:
-    return NodeContents("texcoord", "vector2", {"name": name})
+def _texcoords(name: str, fallback: Input | None = None) -> NodeContents:
+    return NodeContents("texcoord", "vector2", {"name": name, **({} if fallback is None else {"fallback": fallback})})
 
 
 _PREVIEW_SURFACE = "UsdPreviewSurface"
+# Before the name of a plugin of Mitsuba, in the identifier of a node.
+_PLUGIN = "mitsuba_"
+# Renderers whose outputs of a material are read, the preferred first; "" for any renderer.
+_CONTEXTS = ("mitsuba", "mtlx", "")
 _PREVIEW_PORTS = [_Port(name, "string" if name == "opacityMode" else "", value) for name, value in PREVIEW.items()]
-_PREVIEW_PORTS += [_Port(name, "") for name in ("normal", "occlusion", *LEFT_OUT[_PREVIEW_SURFACE])]
+_PREVIEW_PORTS += [_Port("normal", ""), _Port("occlusion", ""), _Port("displacement", "", 0.0)]
 _TEXTURE_PORTS = [
     _Port("file", "asset"), _Port("st", "texcoord", _texcoords("st")), _Port("sourceColorSpace", "string", "auto"),
     _Port("wrapS", "string", "useMetadata"), _Port("wrapT", "string", "useMetadata"),
-    _Port("scale", "", [1.0] * 4), _Port("bias", "", [0.0] * 4), _Port("fallback", "", [0.0, 0.0, 0.0, 1.0]),
+    _Port("scale", "constant", [1.0] * 4), _Port("bias", "constant", [0.0] * 4),
+    _Port("fallback", "constant", [0.0, 0.0, 0.0, 1.0]),
 ]  # fmt: skip
 _TRANSFORM_PORTS = [
-    _Port("in", "texcoord", _texcoords("st")), _Port("rotation", "", 0.0),
-    _Port("scale", "", [1.0, 1.0]), _Port("translation", "", [0.0, 0.0]),
+    _Port("in", "texcoord", _texcoords("st")), _Port("rotation", "constant", 0.0),
+    _Port("scale", "constant", [1.0, 1.0]), _Port("translation", "constant", [0.0, 0.0]),
 ]  # fmt: skip
-_PRIMVAR_PORTS = [_Port("varname", "string", ""), _Port("fallback", "", 0.0)]
+_DISPLACEMENT_PORTS = [_Port("displacement", "float", 0.0), _Port("scale", "float", 1.0)]
+# Of readers of primvars, by the ends of their names; others read numbers.
+_PRIMVAR_WIDTHS = {"float2": 2, "float3": 3, "float4": 4, "point": 3, "normal": 3, "vector": 3}
 _TEXTURE_OUTPUTS = ("rgb", "r", "g", "b", "a")
 _COLOR_SPACES = ("auto", "raw", "sRGB")
 # Wrap modes of UsdUVTexture, and address modes of MaterialX.
@@ -63,10 +75,8 @@ _IS_SRGB = {
     "srgb_texture": True, "sRGB": True, "g22_rec709": True, "rec709_display": True,
     "": False, "lin_rec709": False, "raw": False, "Raw": False, "none": False, "data": False, "lin_srgb": False,
 }  # fmt: skip
-# Nodes that an expression may have when what several nodes share is counted for each.
-_MOST_NODES = 10_000
-# Where a mapping of texture coordinates is tried out: whether it is affine.
-_TRIED = np.array([[0, 0], [1, 0], [0, 1], [0.37, 0.61], [-2.3, 5.7], [17.1, -3.9], [-8.4, -11.2]])
+# Nodes of an expression, shared ones counted for each use; and shaders that lead to each other in a row.
+_MOST_NODES, _DEEPEST = 10_000, 60
 
 
 def _path_of(asset: Any, attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
@@ -79,7 +89,7 @@ def _path_of(asset: Any, attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
 
 
 class MaterialReader:
-    """Reads materials, each once, by networks of shaders of USD and of those that are definitions of MaterialX."""
+    """Reads materials, each once: shading networks of USD, MaterialX and Mitsuba."""
 
     def __init__(self, time: Usd.TimeCode, notes: StageWarnings) -> None:
         self._time, self._notes = time, notes
@@ -87,6 +97,7 @@ class MaterialReader:
         # Outputs of shaders, by path and name, and numbers of nodes by the identity of the expression.
         self._known: dict[tuple[str, str], Input | None] = {}
         self._sizes: dict[int, int] = {}
+        self._depth = 0
 
     def bound(self, prim: Usd.Prim) -> MaterialContents | None:
         """The material bound to a prim; None if there is none or it is not supported."""
@@ -98,14 +109,14 @@ class MaterialReader:
         return None
 
     def _material(self, material: UsdShade.Material) -> MaterialContents | None:
-        """A material; None if it is not supported. Of those that differ by their names only, it is the first."""
+        """A material, or an equal one with another name; None if it is not supported."""
         path = str(material.GetPath())
         if path not in self._materials:
             try:
                 contents = self._contents(material)
-            except (AttributeError, TypeError, ValueError, IndexError, RecursionError):
+            except MaterialError as error:
                 what = "materials whose inputs have other types than their model's are ignored"
-                self._notes.add(f"{what}, and display colours are used", path)
+                self._notes.add(f"{what}, and display colours are used", f"{path}: {error}")
                 contents = None
             alike = (other for other in self._materials.values() if same(other, contents, frozenset({"name"})))
             self._materials[path] = next(alike, contents)
@@ -113,26 +124,59 @@ class MaterialReader:
 
     def _contents(self, material: UsdShade.Material) -> MaterialContents | None:
         path = material.GetPath()
-        surfaces = [surface for context in ("mtlx", "") if (surface := material.ComputeSurfaceSource(context)[0])]
+        contexts = _contexts(material.GetSurfaceOutputs())
+        if others := [f"outputs:{name}:surface" for name in contexts if name not in _CONTEXTS]:
+            self._notes.add("surfaces of other renderers are ignored", f"{', '.join(others)} of {path}")
+        found = (material.ComputeSurfaceSource(name)[0] for name in _CONTEXTS if name in contexts)
+        surfaces = [surface for surface in found if surface]
         read = next((inputs for inputs in map(self._surface, surfaces) if inputs is not None), None)
         if read is None:
             kinds = ", ".join(f'"{surface.GetShaderId() or "of files"}"' for surface in surfaces)
             what = f"surface shaders {kinds}" if surfaces else "materials without a surface shader"
-            self._notes.add(f"{what} are ignored, and display colours are used; expected {', '.join(MODELS)}", path)
+            expected = f"{', '.join(MODELS)} or {_PLUGIN}NAME"
+            self._notes.add(f"{what} are ignored, and display colours are used; expected {expected}", path)
             return None
         if material.ComputeVolumeSource()[0]:
             self._notes.add("volumes of materials are ignored", path)
         model, inputs = read
-        names = [name for name in LEFT_OUT[model] if not is_all(inputs.get(name, 0.0), 0)]
+        heights = self._displacement(material)
+        if model == _PLUGIN:
+            return MaterialContents(str(path), {**inputs, **heights})
+        names = [name for name in LEFT_OUT[model] if not nodes.is_all(inputs.get(name, 0.0), 0)]
         if names:
             self._notes.add(f"inputs of {model} that Mitsuba's BSDFs lack are ignored", f"{', '.join(names)} of {path}")
         if any(inputs.get(name, 0.0) != 0 for name in ("subsurface", "subsurface_weight")):
             self._notes.add("subsurface scattering is rendered as diffuse reflection of its colour", path)
-        return surface_models.material(str(path), model, inputs)
+        contents = surface_models.material(str(path), model, inputs)
+        if not heights and not nodes.is_all(inputs.get("displacement", 0.0), 0):
+            what = f"displacement of {model} is ignored where the material has no connected outputs:displacement"
+            self._notes.add(what, path)
+        return replace(contents, inputs={**contents.inputs, **heights})
+
+    def _displacement(self, material: UsdShade.Material) -> dict[str, Input]:
+        """Heights along the normal, and their scale, where a material has a displacement."""
+        contexts = _contexts(material.GetDisplacementOutputs())
+        context = next((name for name in _CONTEXTS if name in contexts), "")
+        shader, output, _ = material.ComputeDisplacementSource(context)
+        if not shader:
+            return {}
+        scale: Input | None = 1.0
+        if shader.GetShaderId() == _PREVIEW_SURFACE:
+            heights = self._input(shader, _Port("displacement", "", 0.0))
+        elif shader.GetShaderId() == "ND_displacement_float":
+            heights, scale = self._inputs(shader, _DISPLACEMENT_PORTS).values()
+        else:
+            heights = self._output(shader, output)
+        heights, scale = 0.0 if heights is None else heights, 1.0 if scale is None else scale
+        if not isinstance(heights, PrimvarContents):
+            return {"displacement": surface_models.number("multiply", heights, scale)}
+        return {"displacement": heights, "displacement_scale": float(nodes.constant(scale)[0])}
 
     def _surface(self, shader: UsdShade.Shader) -> tuple[str, dict[str, Input]] | None:
-        """Model of a surface, and its inputs but the vectors of the surface itself; None if it is of no known model."""
+        """Model of a surface, and all its inputs except geometric ones; None if it is of no known model."""
         name = shader.GetShaderId() or ""
+        if name.startswith(_PLUGIN):
+            return _PLUGIN, {"bsdf": self._plugin(shader)}
         if name == _PREVIEW_SURFACE:
             model, ports = name, _PREVIEW_PORTS
         elif not name.startswith("ND_") or not any(f"_{known}_" in name for known in MODELS):
@@ -148,7 +192,7 @@ class MaterialReader:
         return (model, inputs) if model in MODELS else None
 
     def _ports(self, definition: MaterialX.NodeDef) -> list[_Port]:
-        return [_Port(d.getName(), d.getType(), self._usual(d)) for d in definition.getActiveInputs()]
+        return [_Port(d.getName(), d.getType(), self._default(d)) for d in definition.getActiveInputs()]
 
     def _inputs(self, shader: UsdShade.Shader, ports: list[_Port]) -> dict[str, Input | None]:
         names = sorted({given.GetBaseName() for given in shader.GetInputs()} - {port.name for port in ports})
@@ -158,34 +202,46 @@ class MaterialReader:
         return {port.name: self._input(shader, port) for port in ports}
 
     def _input(self, shader: UsdShade.Shader, port: _Port) -> Input | None:
-        """An input of a shader; None for a vector of the surface."""
+        """An input of a shader; None for a vector of the surface. Raises MaterialError if it has another type."""
         given = shader.GetInput(port.name)
         attribute = next(iter(given.GetValueProducingAttributes() if given else ()), None)
         if attribute is None:
             stage = shader.GetPrim().GetStage()
             if given and not all(stage.GetPropertyAtPath(path) for path in given.GetAttr().GetConnections()):
-                what = "connections of inputs to what is not there are ignored"
+                what = "connections of inputs to missing attributes are ignored"
                 self._notes.add(what, given.GetAttr().GetPath())
             if port.kind == "texcoord":
                 what = f"textures read the texture coordinates st where {port.name} is not connected"
                 self._notes.add(what, shader.GetPath())
-            return port.usual
-        if UsdShade.Utils.GetType(attribute.GetName()) == UsdShade.AttributeType.Output:
-            made = self._output(UsdShade.Shader(attribute.GetPrim()), attribute.GetBaseName())
-            return port.usual if made is None else made
-        value = value_at(attribute, self._time)
+            return port.default
+        if not UsdShade.Output.IsOutput(attribute):
+            return self._value(attribute, port)
+        if port.kind in ("constant", "string"):
+            what = f"connections of {port.name} of {shader.GetShaderId()} to shaders are ignored"
+            self._notes.add(what, shader.GetPath())
+            return port.default
+        made = self._output(UsdShade.Shader(attribute.GetPrim()), attribute.GetBaseName())
+        if made is not None and port.kind in nodes.CHANNELS:
+            _require_width(nodes.width_of(made), port, given.GetAttr())
+        return port.default if made is None else made
+
+    def _value(self, attribute: Usd.Attribute, port: _Port) -> Input | None:
+        value, is_file = value_at(attribute, self._time), port.kind in ("filename", "asset")
         if value is None:
-            return port.usual
-        if port.kind in ("filename", "asset"):
+            return port.default
+        if is_file != isinstance(value, Sdf.AssetPath):
+            raise MaterialError(f"{attribute.GetPath()} is {'no' if is_file else 'a'} file")
+        if is_file:
             # A picture of four channels that is everywhere.
             path, is_raw = _path_of(value, attribute, self._time), not self._is_srgb(port, attribute)
             return TextureContents(path, "rgba", "raw" if is_raw else "sRGB")
         if isinstance(value, str) or port.kind == "string":
-            return str(value) if port.kind == "string" else port.usual
-        plain = np.asarray(value, dtype=np.float64)
-        if self._is_srgb(port, attribute):
-            plain = decoded(plain)
-        return plain.ravel().tolist() if plain.ndim else float(plain)
+            return str(value) if port.kind == "string" else port.default
+        numbers = np.asarray(value)
+        is_finite = numbers.dtype.kind in "biuf" and np.isfinite(numbers).all()
+        _require_width(numbers.size if is_finite else 0, port, attribute)
+        numbers = decoded(numbers.astype(np.float64)) if self._is_srgb(port, attribute) else numbers.astype(np.float64)
+        return numbers.ravel().tolist() if numbers.ndim else float(numbers)
 
     def _is_srgb(self, port: _Port, attribute: Usd.Attribute) -> bool:
         """Whether an attribute says that its colours are encoded."""
@@ -195,8 +251,7 @@ class MaterialReader:
             self._notes.add(what, attribute.GetPath())
         return _IS_SRGB.get(space, False)
 
-    def _usual(self, declared: MaterialX.Input) -> Input | None:
-        """Default of an input without a value or connection."""
+    def _default(self, declared: MaterialX.Input) -> Input | None:
         geometry = declared.getDefaultGeomPropString()
         if geometry:
             return _texcoords("st") if geometry == "UV0" else None
@@ -207,9 +262,18 @@ class MaterialReader:
         """What a shader computes, read once; None if that is unknown."""
         key = str(shader.GetPath()), output
         if key not in self._known:
+            if self._depth > _DEEPEST:
+                raise MaterialError(f"more than {_DEEPEST} shaders in a row")
             # A network that leads to itself has no value.
             self._known[key] = 0.0
-            self._known[key] = self._computed(shader, output)
+            self._depth += 1
+            try:
+                self._known[key] = self._computed(shader, output)
+            except MaterialError:
+                del self._known[key]
+                raise
+            finally:
+                self._depth -= 1
         return self._known[key]
 
     def _computed(self, shader: UsdShade.Shader, output: str) -> Input | None:
@@ -217,16 +281,21 @@ class MaterialReader:
         if name == "UsdUVTexture":
             return self._texture(shader, output)
         if name == "UsdTransform2d":
-            given = self._usd_inputs(shader, _TRANSFORM_PORTS)
-            scaled = node("multiply", "vector2", in1=given["in"], in2=given["scale"])
-            amount = -constant(given["rotation"], 1)[0]
-            turned = scaled if amount == 0 else node("rotate2d", "vector2", in_=scaled, amount=amount)
-            return node("add", "vector2", in1=turned, in2=given["translation"])
+            given: dict[str, Any] = self._inputs(shader, _TRANSFORM_PORTS)
+            scaled = nodes.node("multiply", "vector2", in1=given["in"], in2=given["scale"])
+            amount = -nodes.constant(given["rotation"], 1)[0]
+            turned = scaled if amount == 0 else nodes.node("rotate2d", "vector2", in_=scaled, amount=amount)
+            return nodes.node("add", "vector2", in1=turned, in2=given["translation"])
         if name.startswith("UsdPrimvarReader"):
-            given = self._usd_inputs(shader, _PRIMVAR_PORTS)
-            if name.endswith("float2"):
-                return self._coordinates(given["varname"] or "st", "fallback", given["fallback"], path)
-            return PrimvarContents(given["varname"], constant(given["fallback"]).tolist())
+            width = _PRIMVAR_WIDTHS.get(name.rpartition("_")[2], 1)
+            zero: Input = 0.0 if width == 1 else [0.0] * width
+            ports = [_Port("varname", "string", ""), _Port("fallback", "constant", zero)]
+            read: dict[str, Any] = self._inputs(shader, ports)
+            if width == 2:
+                return _texcoords(read["varname"] or "st", read["fallback"])
+            return PrimvarContents(read["varname"], nodes.constant(read["fallback"], width).tolist())
+        if name.startswith(_PLUGIN):
+            return self._plugin(shader)
         definition = library().getNodeDef(name) if has_materialx() else None
         if definition is None:
             kind = name or shader.GetPrim().GetTypeName()
@@ -235,23 +304,39 @@ class MaterialReader:
             return None
         return self._made(definition, output, self._inputs(shader, self._ports(definition)), path)
 
-    def _usd_inputs(self, shader: UsdShade.Shader, ports: list[_Port]) -> dict[str, Any]:
-        """Inputs of a shader of USD, of which texture coordinates alone may be connected to others."""
-        inputs: dict[str, Any] = self._inputs(shader, ports)
-        for port in ports:
-            value = inputs[port.name]
-            if port.kind in ("asset", "texcoord"):
-                continue
-            if not is_constant(value):
-                what = f"connections of {port.name} of {shader.GetShaderId()} to shaders are ignored"
-                self._notes.add(what, shader.GetPath())
-                inputs[port.name] = port.usual
-            elif isinstance(port.usual, list) and np.shape(value) != np.shape(port.usual):
-                raise TypeError(f"{port.name} is {value}; expected {len(port.usual)} numbers")
-        return inputs
+    def _plugin(self, shader: UsdShade.Shader) -> TextureContents | NodeContents:
+        """A plugin of Mitsuba with its parameters; of bitmaps, the picture."""
+        name, path = shader.GetShaderId().removeprefix(_PLUGIN), shader.GetPath()
+        parameters: dict[str, Input] = {}
+        for given in shader.GetInputs():
+            key, attribute = given.GetBaseName(), next(iter(given.GetValueProducingAttributes()), None)
+            value: Any = None if attribute is None else value_at(attribute, self._time)
+            if attribute is None or UsdShade.Output.IsOutput(attribute):
+                value = self._input(shader, _Port(key, ""))
+            elif isinstance(value, Sdf.AssetPath):
+                value = _path_of(value, attribute, self._time)
+            elif not isinstance(value, (bool, int, float, str)):
+                numbers = np.asarray(value, dtype=np.float64)
+                value = (numbers.T[:3, :3] if numbers.ndim == 2 else numbers).ravel().tolist()
+            parameters |= {} if value is None else {key: value}
+        if name not in ("bitmap", "checkerboard"):
+            return NodeContents(name, "mitsuba", parameters)
+        matrix: Any = parameters.pop("to_uv", np.eye(3).ravel().tolist())
+        if np.size(matrix) != 9:
+            raise MaterialError(f"to_uv of {path} is no matrix")
+        to_uv = np.reshape(matrix, (3, 3)) @ V_DOWN
+        if name == "checkerboard":
+            placed: dict[str, Input] = {"to_uv": to_uv.ravel().tolist(), "": _texcoords("st")}
+            return NodeContents(name, "mitsuba", {**parameters, **placed})
+        file, wrap = (str(parameters.pop(key, usual)) for key, usual in (("filename", ""), ("wrap_mode", "repeat")))
+        space = "raw" if parameters.pop("raw", False) else "auto"
+        if parameters:
+            self._notes.add("inputs of mitsuba_bitmap are ignored", f"{', '.join(parameters)} of {path}")
+        return TextureContents(file, "rgb", space, wrap, to_uv=V_DOWN @ to_uv)
 
     def _texture(self, shader: UsdShade.Shader, output: str) -> Input | None:
-        path, given = shader.GetPath(), self._usd_inputs(shader, _TEXTURE_PORTS)
+        path = shader.GetPath()
+        given: dict[str, Any] = self._inputs(shader, _TEXTURE_PORTS)
         if output not in _TEXTURE_OUTPUTS:
             self._notes.add(f'the output "{output}" of textures is not there; rgb is used', path)
             output = "rgb"
@@ -263,15 +348,9 @@ class MaterialReader:
             expected = ", ".join(_COLOR_SPACES)
             self._notes.add(f'sourceColorSpace "{space}" of textures is ignored; expected {expected}', path)
             space = "auto"
-        picture = replace(
-            file,
-            channel=output,
-            color_space=space,
-            wrap=self._wrap(given, ("wrapS", "wrapT"), path),
-            scale=given["scale"],
-            bias=given["bias"],
-            fallback=given["fallback"],
-        )
+        numbers = {name: given[name] for name in ("scale", "bias", "fallback")}
+        wrap = self._wrap(given, ("wrapS", "wrapT"), path)
+        picture = replace(file, channel=output, color_space=space, wrap=wrap, **numbers)
         return self._placed(picture, "color3" if output == "rgb" else "float", given["st"])
 
     def _wrap(self, given: dict[str, Any], names: tuple[str, str], prim: object) -> str:
@@ -302,9 +381,9 @@ class MaterialReader:
         if category == "texcoord":
             return _texcoords("st")
         if category == "geomcolor":
-            return PrimvarContents("displayColor", [0.0] * CHANNELS[kind])
+            return PrimvarContents("displayColor", [0.0] * nodes.CHANNELS[kind])
         implementation = definition.getImplementation()
-        is_known = category in OPERATIONS or category in SAMPLED or category in _SPECIAL
+        is_known = category in nodes.OPERATIONS or category in nodes.SAMPLED or category in _SPECIAL
         if isinstance(implementation, MaterialX.NodeGraph) and not is_known:
             return self._expanded(implementation, output, inputs, prim)
         if category == "heighttonormal" and "texcoord" in inputs:
@@ -314,23 +393,22 @@ class MaterialReader:
         if category in _SPECIAL:
             return _SPECIAL[category](self, kind, inputs, prim)
         there = {name: value for name, value in inputs.items() if value is not None}
-        if kind not in CHANNELS or not is_known or len(there) < len(inputs):
+        if kind not in nodes.CHANNELS or not is_known or len(there) < len(inputs):
             what = f'MaterialX nodes "{category}" are ignored; their first input is used instead, or 0'
             self._notes.add(what, prim)
             return next((value for name, value in there.items() if name.startswith("in")), 0.0)
         # Nodes of inputs, counted as often as they are read.
-        size = sum(self._sizes.get(id(value), 1) for value in there.values() if not is_constant(value))
+        size = sum(self._sizes.get(id(value), 1) for value in there.values() if not nodes.is_constant(value))
         if size > _MOST_NODES:
             self._notes.add(f"networks of more than {_MOST_NODES} nodes are ignored; 0 is used instead", prim)
             return 0.0
-        made = node_of(category, kind, there)
+        made = nodes.node_of(category, kind, there)
         self._sizes[id(made)] = 1 + size
         return made
 
     def _expanded(
         self, graph: MaterialX.NodeGraph, output: str, given: dict[str, Input | None], prim: object
     ) -> Input | None:
-        """What a graph of the library computes."""
         made: dict[tuple[str, str], Input | None] = {}
 
         def of_port(port: Any) -> Input | None:
@@ -344,7 +422,7 @@ class MaterialReader:
                 inner = graph.getNode(name)
                 definition = inner.getNodeDef("", True)
                 inputs = {
-                    declared.name: declared.usual
+                    declared.name: declared.default
                     if (inside := inner.getInput(declared.name)) is None
                     else of_port(inside)
                     for declared in self._ports(definition)
@@ -355,7 +433,7 @@ class MaterialReader:
         return of_port(graph.getOutput(output) or graph.getOutputs()[0])
 
     def _image(self, kind: str, given: dict[str, Input | None], prim: object) -> Input:
-        file, fallback, width = given["file"], given.get("default"), CHANNELS[kind]
+        file, fallback, width = given["file"], given.get("default"), nodes.CHANNELS[kind]
         usual = np.zeros(4)
         if isinstance(fallback, (int, float, list)):
             usual[: np.size(fallback)] = fallback
@@ -365,7 +443,7 @@ class MaterialReader:
         for name, neutral in _NEUTRAL.items():
             if given.get(name, neutral) != neutral:
                 self._notes.add(f"{name} of images is ignored", prim)
-        if fallback is not None and not is_constant(fallback):
+        if fallback is not None and not nodes.is_constant(fallback):
             self._notes.add("default of images is ignored unless it is constant", prim)
         wrap = self._wrap(given, ("uaddressmode", "vaddressmode"), prim)
         picture = replace(file, channel="rgba"[:width], wrap=wrap, fallback=usual.tolist())
@@ -374,40 +452,40 @@ class MaterialReader:
     def _placed(self, picture: TextureContents, kind: str, where: Input | None) -> Input:
         """A picture at texture coordinates; a node of a type if these are no affine function of those of the mesh."""
         if isinstance(where, PrimvarContents):
-            return replace(picture, texcoords=where.name)
+            return replace(picture, texcoords=_texcoords(where.name, where.fallback[:2]))
         where = [0.0, 0.0] if where is None else where
-        names = {str(leaf.inputs["name"]) if isinstance(leaf, NodeContents) else None for leaf in leaves(where)}
-        to_uv = None if len(names) > 1 or None in names else _affine_map(where)
+        sets = [leaf for leaf in leaves(where) if isinstance(leaf, NodeContents)]
+        to_uv = nodes.affine_map(where) if all(same(leaf, sets[0]) for leaf in sets) else None
         if to_uv is None:
             return NodeContents("image", kind, {"file": picture, "texcoord": where})
-        return replace(picture, to_uv=to_uv, texcoords=str(next(iter(names), "st")))
+        return replace(picture, to_uv=to_uv, texcoords=sets[0] if sets else picture.texcoords)
 
     def _attribute(self, kind: str, given: dict[str, Input | None], prim: object) -> Input:
         """An attribute of the mesh; texture coordinates if it has two components."""
         name, fallback = str(given["geomprop"]), given.get("default")
         if kind == "vector2":
-            return self._coordinates(name, "default", 0.0 if fallback is None else fallback, prim)
+            if fallback is not None and not nodes.is_constant(fallback):
+                self._notes.add("default of texture coordinates is ignored unless it is constant", prim)
+            return _texcoords(name, fallback if isinstance(fallback, list) else [0.0, 0.0])
         usual = fallback if isinstance(fallback, (int, float, list)) else 0.0
-        return PrimvarContents(name, constant(usual, CHANNELS.get(kind, 1)).tolist())
-
-    def _coordinates(self, name: str, port: str, fallback: Input, prim: object) -> Input:
-        if not is_constant(fallback) or np.any(np.asarray(fallback) != 0):
-            self._notes.add(f"{port} of texture coordinates is ignored, and (0, 0) is used", prim)
-        return _texcoords(name)
+        return PrimvarContents(name, nodes.constant(usual, nodes.CHANNELS.get(kind, 1)).tolist())
 
     def _normal(self, _kind: str, given: dict[str, Input | None], _prim: object) -> Input | None:
         """A normal map in tangent space, from -1 to 1."""
         picture, scale = given["in"], given["scale"]
-        if picture is None or scale is None or is_constant(picture):
+        if picture is None or scale is None or nodes.is_constant(picture):
             return None
-        x, y = (node("extract", "float", in_=scale, index=float(k)) for k in (0, 1))
-        factor = node("combine3", "vector3", in1=x, in2=y, in3=1.0)
-        turned = node("multiply", "vector3", in1=picture, in2=node("multiply", "vector3", in1=factor, in2=2.0))
-        turned = node("add", "vector3", in1=turned, in2=node("multiply", "vector3", in1=factor, in2=-1.0))
+        x, y = (nodes.node("extract", "float", in_=scale, index=float(k)) for k in (0, 1))
+        factor = nodes.node("combine3", "vector3", in1=x, in2=y, in3=1.0)
+        doubled, less = (nodes.node("multiply", "vector3", in1=factor, in2=k) for k in (2.0, -1.0))
+        turned = nodes.node("multiply", "vector3", in1=picture, in2=doubled)
+        turned = nodes.node("add", "vector3", in1=turned, in2=less)
         return replace(turned, fallback=[0.0, 0.0, 1.0, 1.0]) if isinstance(turned, TextureContents) else turned
 
 
-_SPECIAL: dict[str, Callable[..., Input | None]] = {
+# Reads a node of MaterialX of a type, with its inputs, at a prim.
+_Reading = Callable[[MaterialReader, str, dict[str, Input | None], object], Input | None]
+_SPECIAL: dict[str, _Reading] = {
     "image": MaterialReader._image,
     "geompropvalue": MaterialReader._attribute,
     "geompropvalueuniform": MaterialReader._attribute,
@@ -415,11 +493,11 @@ _SPECIAL: dict[str, Callable[..., Input | None]] = {
 }
 
 
-def _affine_map(where: Input) -> NDArray[np.float64] | None:
-    """Matrix ``(3, 3)`` of an affine function of texture coordinates; None if it is no such function."""
-    points = np.broadcast_to(evaluate(where, _TRIED), _TRIED.shape).astype(np.float64)
-    matrix = np.eye(3)
-    matrix[:2, 2] = points[0]
-    matrix[:2, 0], matrix[:2, 1] = points[1] - points[0], points[2] - points[0]
-    error = np.abs(_TRIED @ matrix[:2, :2].T + matrix[:2, 2] - points).max()
-    return matrix if error <= 1e-4 * max(1.0, np.abs(points).max()) else None
+def _contexts(outputs: list[UsdShade.Output]) -> list[str]:
+    """Renderers that connected outputs are for; "" for any."""
+    return [output.GetBaseName().rpartition(":")[0] for output in outputs if output.HasConnectedSource()]
+
+
+def _require_width(width: int, port: _Port, attribute: Usd.Attribute) -> None:
+    if not width or (port.width and width != port.width and (width > 1 or port.kind == "constant")):
+        raise MaterialError(f"{attribute.GetPath()}; expected {port.width or 'some'} finite numbers")

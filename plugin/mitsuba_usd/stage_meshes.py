@@ -11,10 +11,12 @@ import numpy as np
 from mitsuba_subdivision.cage import Attribute, CageContents, CageError, CageSource, require_range, shortened
 from mitsuba_subdivision.files import MeshReader, Skinning, require_types, value_at
 from mitsuba_subdivision.mesh import IntArray
+from mitsuba_subdivision.studio import HIGHEST_RATE
 from numpy.typing import NDArray
 from pxr import Usd, UsdGeom, UsdLux, UsdShade
 
-from .contents import MaterialContents, ShapeContents
+from .contents import Input, MaterialContents, ShapeContents
+from .materialx_nodes import constant
 from .stage_curves import read_curves
 from .stage_lights_and_camera import read_emission
 from .stage_materials import MaterialReader
@@ -76,10 +78,7 @@ class ShapeReader:
             names = self._primvars(material)
             if names not in cages:
                 cages[names] = reader.contents(*names)
-            cage, uv_name = cages[names], names[1]
-            if uv_name is not None and cage.texcoords is not None and not UsdGeom.PrimvarsAPI(prim).HasPrimvar(uv_name):
-                what = f'texture coordinates "{uv_name}" are missing; the first others of the mesh are used'
-                self._notes.add(what, prim.GetPath())
+            cage = cages[names]
             normals = reader.normals(cage) if cage.scheme is None else None
             shown = None
             if len(materials) > 1:
@@ -88,11 +87,15 @@ class ShapeReader:
                     shown = np.flatnonzero(owner == number)
                 else:
                     cage = replace(cage, holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
-            shapes.append(replace(self._shape(prim, to_world, cage, normals, material), shown_faces=shown))
+            shape = self._shape(prim, to_world, cage, normals, material)
+            shapes.append(replace(shape, shown_faces=shown, rate=self._rate(prim)))
         return shapes
 
+    def _rate(self, prim: Usd.Prim) -> int | None:
+        level = value_at(prim.GetAttribute("mitsuba:subdivision_level"), self._time)
+        return min(1 << min(level, 30), HIGHEST_RATE) if isinstance(level, int) and level >= 0 else None
+
     def _note_velocities(self, mesh: UsdGeom.Mesh) -> None:
-        """Note velocities where points are not those of a sample."""
         if self._time.IsEarliestTime() or not mesh.GetVelocitiesAttr().HasAuthoredValue():
             return
         time = self._time.GetValue()
@@ -138,24 +141,33 @@ class ShapeReader:
         normals: NDArray[np.float64] | None,
         material: MaterialContents | None,
     ) -> ShapeContents:
-        if material and material.texcoords() and cage.texcoords is None:
-            # Of those that are there and do not fit, there is a message already.
-            if not UsdGeom.PrimvarsAPI(prim).HasPrimvar(material.texcoords()[0]):
-                what = "prims without texture coordinates have the colour of their texture at (0, 0)"
-                self._notes.add(what, prim.GetPath())
-            cage = replace(cage, texcoords=Attribute(np.zeros((len(cage.positions), 2)), "vertex"))
+        for name, fallback in [] if material is None else [*material.texcoords().items()][:1]:
+            cage = self._with_texcoords(prim, cage, name, fallback)
         names = COLORS if material is None else material.primvars()
         constants = {name: self._constant(prim, name) for name in names if name not in cage.attributes}
         constants = {name: values for name, values in constants.items() if values}
-        radiance = None
+        radiance, is_normalized = None, False
         if prim.HasAPI(UsdLux.MeshLightAPI):
-            if value_at(UsdLux.LightAPI(prim).GetNormalizeAttr(), self._time):
-                self._notes.add("normalize of mesh lights is ignored", prim.GetPath())
+            is_normalized = bool(value_at(UsdLux.LightAPI(prim).GetNormalizeAttr(), self._time))
             radiance = read_emission(prim, self._time).tolist()
             if not np.isfinite(radiance).all():
                 self._notes.add("mesh lights with numbers that are not finite are ignored", prim.GetPath())
                 radiance = None
-        return ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, constants, radiance)
+        return ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, constants, radiance, is_normalized)
+
+    def _with_texcoords(self, prim: Usd.Prim, cage: CageContents, name: str, fallback: Input | None) -> CageContents:
+        """A cage with texture coordinates of a name, or else with others of its own or the fallback."""
+        is_missing, consequence = (
+            not UsdGeom.PrimvarsAPI(prim).HasPrimvar(name),
+            "the first others of the mesh are used",
+        )
+        if cage.texcoords is None or (is_missing and fallback is not None):
+            place = np.zeros(2) if fallback is None else constant(fallback, 2)
+            consequence = f"textures are read at ({place[0]:g}, {place[1]:g})"
+            cage = replace(cage, texcoords=Attribute(np.tile(place, (len(cage.positions), 1)), "vertex"))
+        if is_missing:
+            self._notes.add(f'texture coordinates "{name}" are missing; {consequence}', prim.GetPath())
+        return cage
 
     def _constant(self, prim: Usd.Prim, name: str) -> list[float]:
         """A primvar of a prim, or of those above, that has one value of one or three numbers; else nothing."""

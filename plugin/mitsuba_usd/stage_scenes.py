@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
+from .own_parameters import with_own_parameters
 from .picture_detail import is_chosen, segments_of, texels_for_pictures, triangles_for_picture, with_rate
 from .scaling import scaled, scaled_camera, size_of
 from .scene_entries import LoadedShapes, Surfaces, scene_entries
@@ -91,7 +92,6 @@ class StageScenes:
         return contents
 
     def _read(self, number: int | None, delay: float = 0.0) -> SceneContents:
-        """Contents of a frame, or of a sub-frame so many time codes later."""
         path, time = self._path, self._time
         if self._files is not None and number is not None:
             path, time = self._files.file(number), self._files.time(number)
@@ -131,7 +131,6 @@ class StageScenes:
         return replace(self._before[1], camera=camera, picture=given.picture)
 
     def _delays(self, first: SceneContents) -> list[float]:
-        """Times of sub-frames after that of a frame: middles of equal parts of the first camera's open shutter."""
         if self._shutter is None:
             return [0.0]
         opens, closes = self._interval or (first.camera.shutter if first.camera else (0.0, 0.0))
@@ -157,7 +156,7 @@ class StageScenes:
         return contents.camera is None or not contents.is_lit
 
     def remarks(self) -> list[str]:
-        """What of a studio is added to the stage, and whether several frames are one picture."""
+        """Remarks on parts of the studio that are added, and on frames that are all the same."""
         contents, reader = self._first and self._first[1], self._reader
         if contents is None or reader is None:
             return []
@@ -202,6 +201,8 @@ class StageScenes:
         else:
             contents, parameters = self._with_copies(contents)
         textures = Textures(self._notes, needed, self._look.texture_size)
+        sees = [rest["sensor"]] if rest and self._has_free_rates else None
+        chosen = with_own_parameters(contents, chosen, parameters, sees, textures, self._notes)
         scene = scene_entries(contents, rest, self._notes, parameters, self._surfaces, textures, chosen)
         self._notes.warn(self.name)
         if not rest:
@@ -261,13 +262,15 @@ class StageScenes:
             shapes.begin_frame()
             textures = Textures(self._notes, self._needed, self._look.texture_size)
             others = {**rest, "sensor": seen}
-            scene = scene_entries(contents, others, self._notes, parameters, Surfaces(), textures, loaded=shapes)
+            any_sensor: list[SceneNode] | None = [] if self._has_free_rates else None
+            chosen = with_own_parameters(contents, {}, parameters, any_sensor, textures, self._notes)
+            made = contents, others, self._notes, parameters, Surfaces(), textures, chosen
+            scene = scene_entries(*made, loaded=shapes)
             self._notes.warn(self.name)
             before = given, seen, studio.load_quietly(studio.finished(scene, self._look, given.up), filter_name)
             yield before[2]
 
     def _sensor(self, contents: SceneContents, first: SceneContents, rest: SceneNode) -> SceneNode:
-        """The camera of a frame."""
         if contents.camera is None:
             return dict(rest["sensor"])
         return sensor(contents.camera, size_for(first, self._look), contents.picture, self._look.spp, self._notes)
@@ -301,7 +304,6 @@ def _moved_sensor(loaded: studio.LoadedScene, before: SceneNode, seen: SceneNode
 
 
 def _turned(sensor: SceneNode, turn: NDArray[np.float64]) -> SceneNode:
-    """A sensor, moved by a transform ``(4, 4)``."""
     return {**sensor, "to_world": mi.ScalarTransform4f(turn.tolist()) @ sensor["to_world"]}
 
 

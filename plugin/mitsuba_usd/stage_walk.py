@@ -31,7 +31,7 @@ _SILENT = (
     "", "Xform", "Scope", "Material", "Shader", "NodeGraph", "Camera", "GeomSubset", "Mesh", "PointInstancer", *GPRIMS,
     "SkelRoot", "Skeleton",
 )  # fmt: skip
-# Prims of which a camera's rig is built.
+# Types of prims of a camera's rig.
 _OF_RIGS = ("", "Camera", "Scope", "Xform")
 _SINGULAR = "instances with singular transforms are ignored"
 
@@ -104,7 +104,6 @@ def _all_prims(stage: Usd.Stage) -> Iterator[Usd.Prim]:
 
 
 def _may_vary(prim: Usd.Prim) -> bool:
-    """Whether a prim itself may differ between times."""
     attributes = prim.GetAuthoredAttributes()
     # Instances go on with their velocities where positions have one time.
     is_instancer = prim.IsA(UsdGeom.PointInstancer)
@@ -216,7 +215,6 @@ class _StageWalk:
     def _add(
         self, prim: Usd.Prim, name: str, root: Usd.Prim, to_root: NDArray[np.float64], below: SceneContents
     ) -> None:
-        """Add what a prim shows."""
         if files.value_at(prim.GetAttribute("model:drawMode"), self._code) not in _FULL_MODES:
             self._notes.add("draw modes of models are ignored; their meshes are shown", prim.GetPath())
 
@@ -282,7 +280,6 @@ class _StageWalk:
         return tuple(bindings)
 
     def _materials_below(self, prim: Usd.Prim) -> list[MaterialContents | None]:
-        """Materials of all that an instance shows."""
         shapes = (part for part in _parts(prim) if part.IsA(UsdGeom.Gprim) or part.IsA(UsdGeom.Subset))
         return [self._materials.bound(part) for part in shapes]
 
@@ -363,7 +360,6 @@ class _StageWalk:
 
 
 def _add_copy(contents: SceneContents, prototype: SceneContents, instance: InstanceContents) -> None:
-    """Add the shapes and lights of a prototype where an instance is."""
     contents.shapes.extend(map(instance.placed, prototype.shapes))
     contents.lights.extend(map(instance.placed, prototype.lights))
 
@@ -380,5 +376,4 @@ def _can_be_instanced(prototype: SceneContents) -> bool:
 
 
 def _parts(root: Usd.Prim) -> Usd.PrimRange:
-    """A prim and its descendants, those of instances among them."""
     return Usd.PrimRange(root, Usd.TraverseInstanceProxies(Usd.PrimIsActive & Usd.PrimIsLoaded))

@@ -20,7 +20,7 @@ class StageWarnings:
     def __init__(self, ignored: Iterable[str] = ()) -> None:
         self._warned = set(ignored)
         self._prims: dict[str, list[str]] = {}
-        # The first message of kinds of which each message names its prim.
+        # First message of each kind whose messages name a prim.
         self._first: dict[str, str] = {}
 
     def add(self, what: str, prim: object) -> None:

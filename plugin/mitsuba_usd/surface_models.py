@@ -22,7 +22,7 @@ COSINE_82 = 1 / 7
 # Difference of reflectances that nobody sees at an edge.
 _VISIBLE = 0.05
 
-# What a surface has, and the value of what it does not say. Widths of GGX lobes are the square of roughness.
+# Material inputs and their defaults. Widths of GGX lobes are the square of roughness.
 NEUTRAL: dict[str, Input] = {
     "base_color": [0.18, 0.18, 0.18],  # Of diffuse reflection, and of metal seen head-on.
     "metalness": 0.0,
@@ -148,7 +148,7 @@ def preview_surface(i: Given) -> dict[str, Input]:
         presence = node("ifgreatereq", "float", value1=opacity, value2=threshold, in1=1.0, in2=0.0)
     elif mode == "transparent" or (mode in ("", 0.0) and is_constant(opacity)):
         presence, transmission = 1.0, node("invert", "float", in_=opacity, amount=1.0)
-    base = times(i("diffuseColor"), _below_coat(i("clearcoat"), 1.5))
+    base = times(i("diffuseColor"), _below_coat(i("clearcoat"), i("ior")))
     return {
         "base_color": base,
         "metalness": 0.0 if is_specular else i("metallic"),
@@ -159,6 +159,7 @@ def preview_surface(i: Given) -> dict[str, Input]:
         "transmission": transmission,
         "coat": i("clearcoat"),
         "coat_roughness": i("clearcoatRoughness"),
+        "coat_ior": i("ior"),
         "emission": i("emissiveColor"),
         "opacity": presence,
     }
@@ -233,7 +234,7 @@ def complement(a: Input) -> Input:
 
 
 def reflectance(ior: Input) -> Input:
-    """What an index of refraction reflects head-on."""
+    """Reflectance of an index of refraction at normal incidence."""
     root = number("divide", plus(ior, -1.0), plus(ior, 1.0))
     return number("multiply", root, root)
 
@@ -287,7 +288,7 @@ def has_white_edges(base: Input, edge: Input) -> bool:
 
 
 def _below_coat(coat: Input, ior: Input) -> Input:
-    """What of the light gets through a coat, head-on."""
+    """Transmittance of a coat at normal incidence."""
     return complement(number("multiply", coat, reflectance(ior)))
 
 
@@ -312,24 +313,15 @@ LEFT_OUT: dict[str, tuple[str, ...]] = {
         "base_diffuse_roughness", "transmission_scatter", "transmission_scatter_anisotropy",
         "transmission_dispersion_scale", "coat_roughness_anisotropy", "thin_film_weight",
     ),
-    "UsdPreviewSurface": ("displacement",),
+    "UsdPreviewSurface": (),
     "gltf_pbr": ("iridescence", "dispersion"),
 }  # fmt: skip
-# What inputs of UsdPreviewSurface are where they are not authored.
+# Inputs of UsdPreviewSurface and their defaults.
 PREVIEW: dict[str, Input] = {
-    "diffuseColor": [0.18, 0.18, 0.18],
-    "emissiveColor": BLACK,
-    "useSpecularWorkflow": 0.0,
-    "specularColor": BLACK,
-    "metallic": 0.0,
-    "roughness": 0.5,
-    "clearcoat": 0.0,
-    "clearcoatRoughness": 0.01,
-    "opacity": 1.0,
-    "opacityMode": "",
-    "opacityThreshold": 0.0,
-    "ior": 1.5,
-}
+    "diffuseColor": [0.18, 0.18, 0.18], "emissiveColor": BLACK, "useSpecularWorkflow": 0.0, "specularColor": BLACK,
+    "metallic": 0.0, "roughness": 0.5, "clearcoat": 0.0, "clearcoatRoughness": 0.01, "ior": 1.5,
+    "opacity": 1.0, "opacityMode": "", "opacityThreshold": 0.0,
+}  # fmt: skip
 
 
 def with_shape(given: Input, values: Mapping[str, list[float]]) -> Input:

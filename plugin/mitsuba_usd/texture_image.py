@@ -16,6 +16,8 @@ from mitsuba_subdivision.srgb import decoded, encoded
 from numpy.typing import NDArray
 
 UDIM = "<UDIM>"
+# From the texture coordinates of USD, whose v points up, to those of Mitsuba's bitmaps, and back.
+V_DOWN = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
 # A file within an archive: archive.usdz[folder/file.png].
 _IN_ARCHIVE = re.compile(r"(.*\.usdz)\[(.*)\]$")
 _JPEG = b"\xff\xd8"
@@ -115,7 +117,6 @@ def _resampled(values: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np
 
 
 def _full(dtype: np.dtype) -> int:
-    """The value that means 1."""
     return int(np.iinfo(dtype).max) if dtype.kind == "u" else 1
 
 
@@ -263,7 +264,6 @@ def _halved(pixels: NDArray, count: int, is_srgb: bool) -> NDArray:
 
 
 def _half(values: NDArray) -> NDArray:
-    """Half an image of 16 bits or of floats."""
     height, width = values.shape[:2]
     if height % 2 or width % 2:
         half = _resampled(values.astype(np.float32), ((height + 1) // 2, (width + 1) // 2))

@@ -14,21 +14,19 @@ import numpy as np
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
-from .contents import NodeContents, TextureContents, leaves, parts
+from .contents import MaterialError, NodeContents, TextureContents, leaves, parts
 from .materialx_nodes import Values, evaluate, fallback_of
 from .stage_warnings import StageWarnings
-from .texture_image import TextureImage, is_srgb_image, linear_values, read_texture_image, with_alpha
+from .texture_image import V_DOWN, TextureImage, is_srgb_image, linear_values, read_texture_image, with_alpha
 
-# From the texture coordinates of USD, whose v points up, to those of Mitsuba's bitmaps.
-_V_DOWN = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
-# Pixels along the unit square of what has no picture, and of what has large ones, many times.
+# Baked resolution without images, and with large tiled images.
 LEAST_PROCEDURAL, MOST = 1024, 4096
 _PIXELS_AT_ONCE = 1 << 20
+Image = TextureContents | NodeContents
 # Values (h, w, k) of a picture's channel, and the transform (3, 3) from texture coordinates to those of the picture.
 Picture = tuple[Values, NDArray[np.float64]]
-# Values (h, w, k) of an expression over a part of the plane of texture coordinates, the uppermost row first; the
-# transform (3, 3) from texture coordinates, whose v points up, to those of the picture, from 0 to 1; and Mitsuba's name
-# of how it continues.
+# Values (h, w, k) of an expression, the uppermost row first; the transform (3, 3) from texture coordinates, whose v
+# points up, to those of the picture, from 0 to 1; and Mitsuba's wrap mode.
 Baked = tuple[NDArray[np.float32], NDArray[np.float64], str]
 
 
@@ -52,52 +50,59 @@ class Textures:
 
     def read(self, uses: Iterable[TextureContents]) -> None:
         """Read the pictures of textures on all processors."""
-        keys = list(dict.fromkeys((use.file, use.color_space) for use in uses))
+        keys = [key for key in dict.fromkeys((use.file, use.color_space) for use in uses) if key not in self._pictures]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             for key, picture in zip(keys, pool.map(self._read, keys), strict=True):
                 self._keep(key, picture)
 
-    def color(self, given: TextureContents | NodeContents, *, is_radiance: bool = False) -> SceneNode:
+    def color(self, given: Image, *, is_radiance: bool = False, is_raw: bool = False) -> SceneNode:
         """A texture of colours, up to 1 unless of radiance, or the fallback of a picture that cannot be read."""
+        if isinstance(given, TextureContents) and is_raw and given.color_space == "auto":
+            given = replace(given, color_space="raw")
         use, picture = self._used(given)
         most = None if is_radiance else 1.0
         if picture is None:
             return {"type": "rgb", "value": np.clip(np.broadcast_to(_fallback(use), (3,)), 0, most).tolist()}
         if isinstance(given, NodeContents):
             picture = replace(picture, pixels=np.clip(picture.pixels, 0, most))
-        return self._bitmap(use, picture, is_raw=use.channel != "rgb")
+        return self._bitmap(use, picture, is_raw=is_raw or use.channel != "rgb")
 
-    def number(self, given: TextureContents | NodeContents) -> SceneNode | float:
+    def number(self, given: Image) -> SceneNode | float:
         """A texture of numbers, or the fallback of a picture that cannot be read."""
         use, picture = self._used(given)
         if picture is None:
             return float(_fallback(use)[0])
         return self._bitmap(replace(use, channel=use.channel[0]), picture, is_raw=True)
 
-    def normals(self, given: TextureContents | NodeContents) -> SceneNode | None:
+    def normals(self, given: Image) -> SceneNode | None:
         """A texture of normals as Mitsuba has them, from 0 to 1; None if the picture cannot be read."""
         use, picture = self._used(given)
         if picture is None:
             return None
+        if picture.pixels.dtype == np.uint8 and use.scale[:2] == [1.0, 1.0] and use.bias[:2] == [0.0, 0.0]:
+            what = (
+                "normal maps of eight bits are normals from 0 to 1 as they are; expected a scale of 2 and a bias of -1"
+            )
+            self._notes.add(what, use.file)
         scale, bias, fallback = (np.array([use.scale, use.bias, use.fallback]) + np.array([[0], [1], [1]])) / 2
         use = replace(use, scale=scale.tolist(), bias=bias.tolist(), fallback=fallback.tolist())
         return self._bitmap(use, picture, is_raw=True)
 
-    def mean(self, given: TextureContents | NodeContents) -> NDArray[np.float64]:
+    def mean(self, given: Image) -> NDArray[np.float64]:
         """Mean of a texture's values, ``(k,)``."""
         use, picture = self._used(given)
         if picture is None:
             return _fallback(use)
         return np.asarray(_values(picture, use).mean(axis=(0, 1), dtype=np.float64))
 
-    def _used(self, given: TextureContents | NodeContents) -> tuple[TextureContents, TextureImage | None]:
+    def _used(self, given: Image) -> tuple[TextureContents, TextureImage | None]:
         """A texture and its picture, or None if that cannot be read; of an expression, its values, computed once."""
         if isinstance(given, TextureContents):
             return given, self._picture(given.file, given.color_space)
         if id(given) not in self._expressions:
             try:
                 values, to_uv, wrap = baked(given, self._source)
-            except (ValueError, IndexError):
+            except MaterialError:
                 what = f'expressions of "{given.category}" with values of other types are ignored; 0.5 is used'
                 files = [source.file for source in leaves(given) if isinstance(source, TextureContents)]
                 self._notes.add(what, ", ".join(files))
@@ -134,7 +139,7 @@ class Textures:
                 self._bitmaps[key] = mi.Bitmap(np.ascontiguousarray(_selected(pixels, channels)))
                 self._bitmaps[key].set_srgb_gamma(is_decoded)
             bitmap = self._bitmaps[key]
-        to_uv = mi.ScalarAffineTransform3f((_V_DOWN @ picture.to_uv @ texture.to_uv).tolist())
+        to_uv = mi.ScalarAffineTransform3f((V_DOWN @ picture.to_uv @ texture.to_uv).tolist())
         return {"type": "bitmap", "bitmap": bitmap, "raw": is_raw, "wrap_mode": texture.wrap, "to_uv": to_uv}
 
     def _picture(self, path: str, color_space: str | None = None) -> TextureImage | None:
@@ -186,7 +191,7 @@ def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float
 
 
 def _selected(pixels: NDArray, channels: list[int]) -> NDArray:
-    """Channels of a picture; of what has no colour or no alpha, those that `with_alpha` makes."""
+    """Channels of a picture; colour or alpha that it lacks are those of `with_alpha`."""
     first, end = channels[0], channels[-1] + 1
     if pixels.shape[2] >= max(3, end):
         return pixels[..., first:end]
@@ -194,10 +199,9 @@ def _selected(pixels: NDArray, channels: list[int]) -> NDArray:
 
 
 def baked(expression: NodeContents, picture_of: Callable[[TextureContents], Picture | None]) -> Baked:
-    """Values of an expression; where there is no picture of a texture, its fallback is taken.
+    """Values of an expression, with fallbacks of missing pictures.
 
-    Where all pictures lie in one place of the plane, at the resolution of the largest; else over the unit square, which
-    repeats.
+    If all pictures have one transform, at the resolution of the largest; else over the unit square, which repeats.
     """
     sources = leaves(expression)
     textures = [source for source in sources if isinstance(source, TextureContents)]
@@ -275,7 +279,6 @@ def _procedural_wrap(expression: NodeContents) -> str:
 
 
 def _looked_up(values: Values, uv: Values, wrap: str) -> Values:
-    """Bilinear interpolation at ``(..., 2)``, whose v points up."""
     from scipy.ndimage import map_coordinates
 
     height, width = values.shape[:2]

@@ -569,6 +569,11 @@ def test_textures_read_the_coordinates_that_they_name(shown):
     picture, messages = told(shown, texture("quadrants.png", name="other"), other, side=8)
     assert not messages
     np.testing.assert_allclose(picture.mean(axis=(0, 1)), [0, 0, 1], atol=0.02)
+    fallback = "float2 inputs:fallback = (0.2, 0.8)\nstring inputs:varname"
+    nodes = texture("quadrants.png", name="none").replace("string inputs:varname", fallback)
+    picture, (message,) = told(shown, nodes, side=4)
+    assert message.endswith('"none" are missing; textures are read at (0.2, 0.8) (/square)')
+    np.testing.assert_allclose(picture, np.broadcast_to([1, 0, 0], picture.shape), atol=1e-6)
     picture = shown(texture("quadrants.png", where="inputs:st = (0.75, 0.75)"), side=4)
     np.testing.assert_allclose(picture, np.broadcast_to([0, 1, 0], picture.shape), atol=1e-6)
 
@@ -630,7 +635,17 @@ def rect_form_factor(a, b, distance):
     return 2 / np.pi * (a / one * np.arctan(b / one) + b / two * np.arctan(a / two))
 
 
+def mesh_light(*body):
+    """Normalised, three times two units wide in the world, and shining down."""
+    place = moved(translate=(0, 0, 4), rotateXYZ=(180, 0, 0), scale=(1.5, 1, 1))
+    lamp = prim("Mesh", "lamp", *body, NORMALIZED, "float inputs:intensity = 50", place, apis=["MeshLightAPI"])
+    return lamp, 50 / 6 * np.pi * rect_form_factor(1.5, 1, 4)
+
+
 LIGHTS = {
+    "mesh": mesh_light(SQUARE),
+    "subdivided mesh": mesh_light(SMOOTH_SQUARE),
+    "point of a sphere without a radius": (light("SphereLight", NORMALIZED, radius=0, intensity=100), 25 / 16),
     "rect": (light("RectLight", width=2, height=3, intensity=5), 5 * np.pi * rect_form_factor(1, 1.5, 4)),
     "rect, normalised, scaled": (
         light("RectLight", NORMALIZED, width=2, height=3, exposure=3, scale=0.5),
@@ -861,15 +876,15 @@ IGNORED_INPUTS = [
     ('"repeat"', '"black"', 'textures with the wrap mode "black" use "clamp"'),
     ('"sRGB"', '"acescg"', 'sourceColorSpace "acescg" of textures is ignored; expected auto, raw, sRGB'),
     (RGB, "float inputs:gain = 2\n...", "does not have are ignored (gain of /paint/te"),
+    ("color3f inputs:diffuseColor.", "normal3f inputs:normal.", "normal maps of eight bits are normals from 0 to 1"),
     (RGB, f"float4 inputs:scale.connect = {READER}\n...", "connections of scale of "),
     (f"float2 inputs:st.connect = {READER}", "", "read the texture coordinates st where st is not"),
-    ('varname = "st"', 'varname = "missing"', 'texture coordinates "missing" are missing; the first others'),
-    ("string inputs:varname", "float2 inputs:fallback = (1, 0)\n...", "fallback of texture coord"),
+    ('varname = "st"', 'varname = "missing"', 'texture coordinates "missing" are missing; textures are read at (0, 0)'),
     ("string inputs:varname", "int inputs:index = 1\n...", "ignored (index of /paint/reader)"),
     ("reader.outputs:result>", "place.outputs:result>", "ignored (pivot of /paint/place)"),
     ("reader.outputs:result>", "odd.outputs:result>", '"Odd" are ignored, and defaults are used; expected UsdUVT'),
     ("outputs:rgb", "outputs:rgba", 'the output "rgba" of textures is not there; rgb is used'),
-    ("outputs:rgb>", "outputs:none>", "connections of inputs to what is not there are ignored (/paint/surface.inputs"),
+    ("outputs:rgb>", "outputs:none>", "connections of inputs to missing attributes are ignored (/paint/surface.inputs"),
     (RGB, "float2 inputs:scale = (1, 1)\n...", "materials whose inputs have other types than their model"),
     ("asset inputs:file = @black.png@", 'string inputs:file = "a"', "materials whose inputs have other types than the"),
     ('"UsdPreviewSurface"', "...\nfloat inputs:gain = 2", "does not have are ignored (gain of /paint/su"),
@@ -900,7 +915,10 @@ IGNORED = [
     (mesh("cube", CUBE, 'string mitsuba:sensor = "/a"'), "mitsuba:sensor of shapes is ignored; ", "(/cube)"),
     (frame("rel products = </p>") + render_product("p", "v", v="lpe:C<RD>"), 'source "lpe:C<RD>" are ignored', "(/v)"),
     (frame("rel products = [</p>, </q>]") + SMALLER, "resolution of render products is ignored; the first", "(/q)"),
-    (light("DiskLight", f"{CONE}40"), "shaping:cone:angle of lights is ignored; ", "(/lamp)"),
+    (light("DiskLight", f"{CONE}40"), "shaping:cone:angle of lights is ignored; Mitsuba's area lights", "(/lamp)"),
+    (light("SphereLight", "asset inputs:shaping:ies:file = @a.ies@"), "; Mitsuba has no lights with IES", "(/lamp)"),
+    (light("SphereLight", "float mitsuba:gain = 2"), "attributes of Mitsuba are ignored at", "(mitsuba:gain of /lamp)"),
+    *((light("SphereLight", f"{CONE}{c}", radius=r), "without power", "(/lamp)") for c, r in ((0, 1), (90, 0))),
     *((changed(old, new), message, ")") for old, new, message in IGNORED_INPUTS),
 ]
 

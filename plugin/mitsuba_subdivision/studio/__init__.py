@@ -1,9 +1,11 @@
 """A neutral studio around a model: camera, lights and backdrop, turntables, frames, and scenes saved as XML."""
 
 from ..regression.scene import LoadedScene
+from ..tessellation import HIGHEST_RATE
 from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
 from .cage_scenes import frame_table, studio_scene
 from .picture import (
+    ERRORS,
     MOST_SEGMENTS,
     MOST_TRIANGLES,
     highest_rate,
@@ -37,6 +39,8 @@ __all__ = [
     "DEFAULT_SPP",
     "DEFAULT_VIEW",
     "ENVIRONMENT",
+    "ERRORS",
+    "HIGHEST_RATE",
     "MOST_SEGMENTS",
     "MOST_TRIANGLES",
     "STUDIO",
