@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import os
-import pickle
 import re
 import time as clock
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from functools import partial
-from hashlib import blake2b
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -26,7 +24,7 @@ from ..evaluation.equations import Evaluator
 from ..files.formats import FORMATS
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..mesh.shared import Shared
+from ..mesh.shared import Content, Shared
 from ..surface import TEXCOORDS, LimitSurface
 from .cage_attributes import RESERVED
 from .parameter_table import PARAMETER_OF_NAME, errors_about, value_of
@@ -386,13 +384,20 @@ def cage_of_arrays(name: str | None, **arguments: Any) -> ControlCage:
     Messages contain ``name``. Without a name, it warns for each shape; with a name, the creator of the cage has warned
     before.
     """
-    # A key without references to arrays.
-    digest = blake2b(pickle.dumps(arguments), digest_size=16).digest()
+    key = name is None, _content(arguments)
     if name is None:
-        return _shared(digest, ControlCage.from_arrays, **arguments)
+        return _shared(key, ControlCage.from_arrays, **arguments)
     with without_warnings():
         # Equal cages with different names are shared, under the name of the first one.
-        return _shared(("named", digest), ControlCage.from_arrays, **arguments, source=CageSource(name))
+        return _shared(key, ControlCage.from_arrays, **arguments, source=CageSource(name))
+
+
+def _content(value: Any) -> Hashable:
+    if isinstance(value, np.ndarray):
+        return Content(value)
+    if isinstance(value, Attribute):
+        return value.interpolation, Content(value.values), Content(value.indices)
+    return tuple((name, _content(item)) for name, item in sorted(value.items())) if isinstance(value, dict) else value
 
 
 def _shared(key: Hashable, make: Callable[..., ControlCage], *arguments: Any, **options: Any) -> ControlCage:
