@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import pickle
 import re
-import tempfile
-import weakref
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from math import isqrt
@@ -167,7 +164,8 @@ class CageScenes:
     """Scene source of one cage in the studio: its contents at a time, and scenes of these.
 
     Where frames have the same topology, the shape that is loaded gets other control points; its patches and weights
-    stay. Each file is read once: contents of frames are kept in temporary files.
+    stay.
+
     Raises CageError, OSError if there is no file of a frame.
     """
 
@@ -197,8 +195,8 @@ class CageScenes:
         self._first: Any = None
         # By which the scene is larger than the cage.
         self.factor: float | None = None
-        self._kept = tempfile.TemporaryDirectory()
-        weakref.finalize(self, self._kept.cleanup)
+        # Frames whose warnings were printed: all are read once for the camera, and again when they are rendered.
+        self._seen: set[int | None] = set()
 
     def at(self, number: int | None = None) -> PosedModel:
         """The cage of a frame; by default, of the file or in memory."""
@@ -208,19 +206,16 @@ class CageScenes:
         path, time = Path(self._cage), self._time
         if self._files is not None and number is not None:
             path, time = self._files.file(number), self._files.time(number)
-        kept = Path(self._kept.name, str(number))
-        is_kept = kept.exists()
         with without_warnings(), noting_warnings() as noted:
-            contents = pickle.loads(kept.read_bytes()) if is_kept else read_file(path, self._prim, time, self._rules)
-            if number is not None and not is_kept:
-                kept.write_bytes(pickle.dumps(contents))
+            contents = read_file(path, self._prim, time, self._rules)
             if self._first is not None and same_topology(contents, self._first[0]):
                 # Frames of the same topology have the same warnings.
                 return self._first[1], np.asarray(contents.positions, dtype=np.float64)
             cage = ControlCage.from_arrays(**{**contents.as_arguments(), **self._rules})
             model = Model(cage, path, prim=self._prim, time=time, scheme=self._scheme)
-        for message in () if is_kept else noted:
+        for message in () if number in self._seen else noted:
             warn(message)
+        self._seen.add(number)
         self._first = self._first or (contents, model)
         return model, cage.positions
 
