@@ -112,7 +112,7 @@ class ParameterDomain:
         return np.stack([u, v], axis=1)[self.inside(np.stack([u, v], axis=1) / degree) >= -1 / (2 * degree)]
 
     def extent(self, uv: ArrayLike) -> FloatArray:
-        """Return ``(s,)`` size of the smallest copy of the domain, of size 1, about (0, 0) that contains ``uv``."""
+        """Return ``(s,)`` size, relative to the domain, of its least copy scaled about (0, 0) that contains ``uv``."""
         u, v = np.moveaxis(np.asarray(uv), -1, 0)
         return u + v if self._is_triangle else np.maximum(u, v)
 
