@@ -216,7 +216,7 @@ def read_only(array: NDArray) -> NDArray:
 
 
 def _integers(values: ArrayLike, name: str, source: CageSource, sizes: IntArray | None = None) -> NDArray[np.integer]:
-    """Check that values are a flat array of integers; ``sizes`` are those of faces, if it has their vertices."""
+    """Check that values are a flat array of integers; if they are vertices of faces, ``sizes`` are the faces' sizes."""
     array = np.asarray(values)
     if array.ndim != 1:
         raise CageError(f"{source.name}: {name} has shape {array.shape}; expected a flat array of integers")

@@ -157,7 +157,7 @@ def part_of_tile(
     element: PatchTree,
     stencils: FloatArray,  # (K_element, K) float64: the element's control points over those of the parent tile
 ) -> tuple[DividedTile, FloatArray]:
-    """Return the tile of an element in a parent tile, one object for equal ones, and its stencils over the parent's."""
+    """Return the tile of a part of a parent tile, the same for equal parts, and its control points over the parent."""
     if element.kind == PartKind.ONLY_CHILD:
         ((child, child_stencils),) = element.children
         return part_of_tile(child, child_stencils @ stencils)

@@ -206,7 +206,7 @@ def curvature(
     first: FloatArray,  # (2, s, 3): derivatives by u, by v
     second: FloatArray,  # (3, s, 3): by uu, uv, vv
 ) -> FloatArray:
-    """Compute Gaussian and mean curvature ``(2, s)``; the mean is positive where it bends towards ``du x dv``."""
+    """Gaussian and mean curvature ``(2, s)``; the mean is positive where the surface bends towards ``du x dv``."""
     du, dv = first
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         a, b, c = _dot(du, du), _dot(du, dv), _dot(dv, dv)

@@ -140,7 +140,7 @@ class IrregularPatch:
 
 
 def level_polynomials(patch: IrregularPatch, form: FloatArray, levels: NDArray[np.int64]) -> FloatArray:
-    """Return ``(l, 3, m, K)`` coefficients, by ``form``, ``(m, R)``, of regular pieces over eigen-coordinates."""
+    """Return ``(l, 3, m, K)`` coefficients of levels' regular pieces over eigen-coordinates, by ``form`` ``(m, R)``."""
     rows: FloatArray = form @ patch.eigen_children
     flat = np.repeat(rows.reshape(-1, 1, rows.shape[2]), len(levels), axis=1)
     powers = times_powers(flat, levels, patch.basis, 1.0).reshape(*rows.shape[:2], len(levels), rows.shape[2])

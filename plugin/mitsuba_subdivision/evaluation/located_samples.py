@@ -288,7 +288,7 @@ def sampled_polynomials(
 
 
 def _in_pieces(scheme: Scheme, leaves: Leaves) -> tuple[IntArray, FloatArray]:
-    """Return pieces of samples, -1 for those that need a plane; and ``(2, n)`` parameters there, from its middle."""
+    """Return the piece of each sample, -1 if it needs a plane, and ``(2, n)`` parameters from the piece's middle."""
     local, number = leaves.uv, np.zeros(len(leaves.uv), dtype=np.int64)
     if leaves.patch is not None:
         level, child, local = locate(scheme.domain, leaves.uv)

@@ -326,7 +326,7 @@ def _semi_sharpness(
     topology: Topology,
     fans: list[tuple[Fan, IntArray]],  # Semi-sharp fans, and their half-edges from the most clockwise one on
 ) -> SemiSharpness:
-    """Return the semi-sharp features at the corners of elements: of all others, only far ends of edges matter."""
+    """Return the semi-sharp features at the corners of elements; of others, only far ends of edges there matter."""
     edges, refined = np.zeros((2, topology.half_edge_count))
     vertices = np.zeros(topology.vertex_count)
     half_edges = np.concatenate([around for _, around in fans])

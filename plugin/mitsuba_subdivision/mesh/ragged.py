@@ -55,7 +55,7 @@ def ranges(first: IntArray, lengths: IntArray) -> NDArray[np.int64]:
 
 
 def chunks_of(count: int, parts: int = 1) -> Iterator[slice]:
-    """Yield successive slices of ``count`` entries of so many ``parts``, to bound temporary memory."""
+    """Yield slices of ``count`` entries to bound temporary memory; shorter ones of entries of many ``parts``."""
     length = max(1, CHUNK_LENGTH // parts)
     for begin in range(0, count, length):
         yield slice(begin, min(begin + length, count))

@@ -34,7 +34,7 @@ FEW_CODES = 1 << 16
 
 
 class Fan(NamedTuple):
-    """Faces around a vertex, in order from one face, the first, and semi-sharp features; no indices, to be compared."""
+    """Faces around a vertex, from the first on, and semi-sharp features; without indices, so that fans can be equal."""
 
     ahead: tuple[int, ...]  # Sizes of the faces from the first on, counter-clockwise up to the border, or all around
     # Sizes of the other faces, clockwise from the first up to the border; None if the faces go all around

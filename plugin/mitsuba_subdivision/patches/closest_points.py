@@ -217,7 +217,7 @@ class _Best:
     def _take(
         self, point: IntArray, squared: FloatArray, slope: FloatArray, half_edge: IntArray, uv: FloatArray
     ) -> None:
-        """Take over nearer locations; among equally near ones, as on edges of adjacent pieces, of the least slope."""
+        """Take over nearer locations; among equally near ones, as on edges of pieces, those of least slope."""
         least = self._squared_distance.copy()
         np.minimum.at(least, point, squared)
         limit = least + self._rounded(least)

@@ -85,7 +85,7 @@ def _nearest(
 
 
 def _step(domain: ParameterDomain, at: FloatArray, jet: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Newton's step ``(s, 2)``, along an edge where it would leave the domain, cut at the next; whether it is full."""
+    """Newton's step ``(s, 2)``, along an edge if it would leave the domain, cut at the next; and whether it is full."""
     normals, difference, tangents = domain.edge_normals, jet[:, 0], jet[:, 1:3]
     gradient = np.einsum("sdx,sx->sd", tangents, difference)
     metric = tangents @ tangents.swapaxes(1, 2)

@@ -147,7 +147,7 @@ class Tips(PartArrays):
 def places_below(
     parts: PolynomialPieces | Tips, domains: Sequence[ParameterMap]
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """``half_edge``, ``matrices`` and ``offsets`` of parts of all parts, whose parameters ``domains`` map to theirs."""
+    """``half_edge``, ``matrices`` and ``offsets`` of parts of all parts; ``domains`` map from their parameters."""
     return (
         np.tile(parts.half_edge, len(domains)),
         np.concatenate([parts.matrices @ domain.matrix for domain in domains]),

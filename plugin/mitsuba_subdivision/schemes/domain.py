@@ -112,7 +112,7 @@ class ParameterDomain:
         return np.stack([u, v], axis=1)[self.inside(np.stack([u, v], axis=1) / degree) >= -1 / (2 * degree)]
 
     def extent(self, uv: ArrayLike) -> FloatArray:
-        """Return ``(s,)`` size of the smallest copy of the domain, of size 1, about (0, 0) that contains ``uv``."""
+        """Return ``(s,)`` size, relative to the domain, of its least copy scaled about (0, 0) that contains ``uv``."""
         u, v = np.moveaxis(np.asarray(uv), -1, 0)
         return u + v if self._is_triangle else np.maximum(u, v)
 
@@ -122,19 +122,16 @@ class ParameterDomain:
         And parameters in the child, with their derivative by the given ones: 2, or -2 where they run backwards.
         ``select`` is `numpy.where`, or ``drjit.select`` for arrays of Dr.Jit.
         """
-        right, upper = u >= 0.5, v >= 0.5
+        is_right = u >= 0.5
+        # At the midpoint of a triangle's third side not both.
+        is_upper = (v >= 0.5) & ~is_right if self._is_triangle else v >= 0.5
+        right, upper = select(is_right, 1, 0), select(is_upper, 1, 0)
+        inner_u, inner_v = 2 * u - right, 2 * v - upper
         if not self._is_triangle:
-            number = select(upper, select(right, 2, 3), select(right, 1, 0))
-            return number, 2 * u - select(right, 1, 0), 2 * v - select(upper, 1, 0), 2
-        # Not both at the midpoint of the third side.
-        upper = upper & ~right
-        is_middle = ~(right | upper) & (u + v >= 0.5)
-        return (
-            select(right, 1, select(upper, 2, select(is_middle, 3, 0))),
-            select(is_middle, 1 - 2 * u, 2 * u - select(right, 1, 0)),
-            select(is_middle, 1 - 2 * v, 2 * v - select(upper, 1, 0)),
-            select(is_middle, -2, 2),
-        )
+            return select(is_upper, 3 - right, right), inner_u, inner_v, 2
+        is_middle = ~(is_right | is_upper) & (u + v >= 0.5)
+        number, speed = select(is_middle, 3, right + 2 * upper), select(is_middle, -2, 2)
+        return number, select(is_middle, 1 - inner_u, inner_u), select(is_middle, 1 - inner_v, inner_v), speed
 
     def clamped(self, uv: FloatArray) -> FloatArray:
         """Return ``(s, 2)`` parameters clamped to the domain, to the nearest point or close to it."""

@@ -234,7 +234,7 @@ class AdaptiveGrid:
         return np.repeat(np.arange(self.side_counts.size, dtype=np.int32), self.side_counts.ravel())
 
     def _numbered(self, edge: IndexArray, vertex: IndexArray) -> tuple[IndexArray, IndexArray]:
-        """Number the samples on sides, equal points, on edges and at vertices of equal numbers, alike.
+        """Number the samples on sides, equal points alike: those on edges and at vertices of equal numbers.
 
         Returns the number of each sample, and the first sample of each number.
         """
@@ -316,7 +316,7 @@ class AdaptiveGrid:
         return (self.position[samples] - begin) / (end - begin)
 
     def parameters(self, samples: IntArray | slice | None = None) -> tuple[IndexArray, FloatArray]:
-        """Tiles and parameters ``(2, n)`` in patches of samples on sides, by default one a vertex, and inner ones."""
+        """Tiles and parameters ``(2, n)`` of samples on sides, by default one for each vertex, and of inner ones."""
         samples = self._numbers[1] if samples is None else samples
         tile, side = np.divmod(self._side[samples], self.side_counts.shape[1])
         corners = self.frames.domain.corners

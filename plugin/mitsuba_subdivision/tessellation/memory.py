@@ -74,7 +74,7 @@ def exceeded_limit(needed: float) -> int | None:
 def available_memory(
     root: str | Path = "/",  # Parent of the folders `proc` and `sys`
 ) -> int | None:
-    """Bytes that the machine, the process's control groups and its own limit leave; None if the system says nothing."""
+    """Bytes that the machine, the process's control groups and its own limit leave; None if that is not reported."""
     from pathlib import Path
 
     root = Path(root)

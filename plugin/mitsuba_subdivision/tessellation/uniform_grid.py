@@ -228,7 +228,7 @@ class UniformGrid:
         return np.concatenate([cells, strip[_cut_cells(count, 2)], [[count**2 - 1, beyond[-1], beyond[-1] + 1]]])
 
     def triangle_parameters(self) -> tuple[FloatArray, FloatArray]:
-        """``(T, 3, 2)`` parameters of a whole element's triangles, and of those of one corner of another, from there.
+        """``(T, 3, 2)`` parameters of a whole element's triangles; and of those at one corner of another, from there.
 
         Some of these may reach beyond u = 1, into the patch of the next corner.
         """

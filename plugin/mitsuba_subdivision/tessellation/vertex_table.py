@@ -37,7 +37,7 @@ PATCHES_TOGETHER = 1 << 7
 
 @dataclass(frozen=True, eq=False)
 class VertexTable:
-    """A tessellation: its vertices as points on polynomials, whose weights no positions change, and its triangles."""
+    """A tessellation: its triangles, and its vertices on polynomials, whose weights do not depend on positions."""
 
     control_count: int
     patch_count: int
@@ -180,7 +180,7 @@ class VertexPolynomials:
 
 
 class VertexRuns(NamedTuple):
-    """The vertices of a tessellation, in runs: samples of one patch. All runs of a kind have the same, in one class."""
+    """Vertices of a tessellation, in runs on one patch each. All of a kind have the same samples of one class."""
 
     patch_class: IntArray  # (k,): index of the class of each kind
     counts: IntArray  # (k,): number of samples of each kind
