@@ -37,10 +37,6 @@ def alike(one, other):
     return one.size == other.size and np.abs(blocks(one) - blocks(other)).max() < SHADE
 
 
-def test_there_are_three():
-    assert [path.stem for path in NOTEBOOKS] == ["dark_spot", "first_picture", "fitting"]
-
-
 @EVERY_NOTEBOOK
 def test_a_notebook_runs_and_shows_what_is_stored(path):
     """With fewer samples and steps. What these change, or the processor by its rounding, is marked as "varies"."""
