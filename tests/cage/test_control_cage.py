@@ -250,15 +250,6 @@ def are_corners_convex(cage):
     return (np.einsum("fki,fki->fk", corners, np.cross(corners - before, after - corners)) > 0).all()
 
 
-def test_cube():
-    cage = cube()
-    assert (cage.vertex_count, cage.face_count) == (8, 6)
-    assert set(map(tuple, np.abs(cage.positions))) == {(1, 1, 1)}
-    assert (cage.topology.twin >= 0).all()
-    assert (cage.topology.vertex_face_count == 3).all()
-    assert are_corners_convex(cage)
-
-
 def test_less_than_three_faces_around_a_vertex_are_an_error():
     with pytest.raises(CageError, match="valence 2; expected at least 3"):
         extraordinary(2)

@@ -72,13 +72,3 @@ def test_fractions_in_the_text_of_a_notebook_come_from_its_cells(path):
     text = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "markdown")
     text = re.sub(r"\$.*?\$|\]\(.*?\)|^\[\d+\]: .*$", "", text, flags=re.MULTILINE)
     assert [number for number in FRACTION.findall(text) if number not in shown] == []
-
-
-def test_a_picture_with_the_dark_spot_is_not_like_one_without():
-    notebook = nbformat.read(FOLDER / "dark_spot.ipynb", as_version=4)
-    (spot,) = (picture(cell.outputs[0]) for cell in notebook.cells if cell.id == "spot")
-    side = spot.height // 2
-    for top in (0, side):
-        stam, stabilized, limit = (spot.crop((x, top, x + side, top + side)) for x in (0, side, 2 * side))
-        assert alike(stabilized, limit)
-        assert not alike(stam, limit)

@@ -93,14 +93,6 @@ def test_fans_are_all_turns_about_each_inner_vertex_from_the_lowest_half_edge(an
         assert not len(fan) or fan[0] == fan.min()
 
 
-def test_turn_is_counter_clockwise():
-    t = cube().topology
-    ends = t.face_vertices[t.next]
-    # From outside, at the corner (1, 1, 1), the outgoing edges turn -x, -y, -z.
-    (first,) = np.flatnonzero((t.face_vertices == 7) & (ends == 6))
-    assert ends[[first, t.turn[first], t.turn[t.turn[first]]]].tolist() == [6, 5, 3]
-
-
 def test_open_faces_have_boundary():
     t = mesh_of(5, [[0, 1, 2], [2, 1, 3]])
     np.testing.assert_array_equal(t.twin, [-1, 3, -1, 1, -1, -1])

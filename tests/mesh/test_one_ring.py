@@ -108,19 +108,6 @@ def test_corners_of_sharpness_ten_are_not_semi_sharp(sharpness):
     assert at_corner.is_semi_sharp == (sharpness < 10)
 
 
-def test_faces_that_meet_at_a_vertex_of_valence_2_are_joined_along_both_edges():
-    topology = cube_with_valence_2().topology
-    ring = one_ring(signature_at(topology, 0, "face"))
-    controls = gathered(ring, topology, [0])[0]
-    assert ring.topology.face_vertices[3] == 3
-    assert controls[3] == 8
-    assert ring.topology.vertex_face_count[3] == 2
-    assert not ring.topology.is_border_vertex[3]
-    # Faces 0 and 1, and the four sides; the bottom is too far away.
-    assert ring.topology.face_count == 6
-    assert len(set(controls)) == ring.vertex_count - 1
-
-
 def test_face_across_one_edge_is_one_face_whichever_way_it_is_reached():
     # The triangle has two edges in common with the element; its third leads to the same face from either end.
     topology = cube_with_valence_2(beside_triangle=True).topology

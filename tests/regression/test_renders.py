@@ -60,7 +60,8 @@ def test_passes_from_files_in_any_order_make_the_image(tmp_path, loaded):
 def test_merging_by_steps_counts_all_batches_and_keeps_what_only_the_first_pass_has(loaded):
     passes = [render_pass(loaded, SAMPLING, i, 4, with_probe=True) for i in (1, 2, 3, 4)]
     assert [image.probe is not None for image in passes] == [True, False, False, False]
-    merged = merge_passes([*passes[:1:-1], merge_passes(passes[:2])])
+    # Ranges of batches interleave.
+    merged = merge_passes([passes[3], merge_passes(passes[::2]), passes[1]])
     assert merged.estimate.batches == 12
     assert merged.metadata["sampling"]["batches"] == [[0, 12]]
     assert np.array_equal(merged.paired, passes[0].paired)

@@ -103,7 +103,7 @@ def test_equal_shapes_of_a_scene_stay_two_and_can_be_written_as_xml():
     assert '<integer name="tessellation_rate" value="3"' in text
 
 
-def test_a_first_picture_imports_little():
+def test_a_first_picture_and_coarse_tessellations_import_little():
     # What Mitsuba itself has imported costs nothing more. These take longest of the rest.
     printed(f"""
 import sys, mitsuba as mi, numpy
@@ -113,6 +113,10 @@ assert "mitsuba.scalar_rgb" not in sys.modules
 mi.set_variant("scalar_rgb")
 scene = {{"type": "scene", "cage": {{"type": "subdivision", "filename": {str(STAR)!r}}}}}
 mi.render(mi.load_dict(scene | {{"sensor": {{"type": "perspective"}}, "integrator": {{"type": "direct"}}}}), spp=1)
+from mitsuba_subdivision import ControlCage, LimitSurface
+tetrahedron = [(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], [(0, 1, 2), (0, 3, 1), (0, 2, 3), (1, 3, 2)]
+for scheme in ("catmull_clark", "loop", "doo_sabin"):
+    LimitSurface(ControlCage(*tetrahedron), scheme).tessellate(4)
 heavy = {{"scipy", "pathlib", "argparse"}}
 assert not heavy & (set(sys.modules) - there), heavy & (set(sys.modules) - there)
 """)
