@@ -1,5 +1,3 @@
-"""The benchmarks run; what they measure is for people to read, not for tests."""
-
 import json
 import re
 import shutil
@@ -18,7 +16,6 @@ needs_llvm = pytest.mark.skipif(llvm_problem() is not None, reason=str(llvm_prob
 
 
 def said(*words):
-    """What a program of this folder prints."""
     done = ran([sys.executable, *words])
     assert done.returncode == 0, done.stderr
     return done.stdout

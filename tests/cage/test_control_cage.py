@@ -1,5 +1,3 @@
-"""Cages of arrays, files and attributes, their contents, edges, triangles and Laplacian; and named ones."""
-
 import dataclasses
 from collections import Counter
 from functools import cached_property
@@ -68,8 +66,6 @@ def test_inputs_are_copied():
 
 
 class NamedCage(ControlCage):
-    """A user's own class, with a value of its own."""
-
     label: str = "none"
 
     @cached_property

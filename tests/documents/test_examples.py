@@ -85,7 +85,6 @@ class Block(NamedTuple):
 
     @property
     def is_left_out(self):
-        """Whether a package is missing that the block needs."""
         needed = re.fullmatch(r"in the tests: needs (\w+)", self.mark)
         return bool(needed and find_spec(needed[1]) is None)
 
@@ -172,10 +171,9 @@ def module(words):
         assert arguments[0] == "install"
         wanted = [word for word in arguments[1:] if not word.startswith("-")]
         assert wanted
-        for word in wanted:
-            package, _, extras = re.fullmatch(r"([\w.-]+)(\[([\w,]+)\])?", word).groups(default="")
-            assert package in (".", OURS, "build", "twine"), word
-            assert set(filter(None, extras.split(","))) <= set(EXTRAS), word
+        for package, *extras in (re.findall(r"[\w.-]+", word) for word in wanted):
+            assert package in (".", OURS, "build", "twine"), words
+            assert {*extras} <= {*EXTRAS}, words
     elif name == "pytest":
         values = dict(itertools.pairwise(arguments))
         assert values.get("-m", MARKERS[0]) in MARKERS
@@ -187,7 +185,6 @@ def module(words):
 
 
 def run_commands(block):
-    """Run the program's commands; check all others."""
     for words in block.commands:
         first, *rest = words
         if first == OURS and block.mark.endswith(OPTIONS_ONLY):

@@ -43,9 +43,8 @@ def test_a_notebook_runs_and_shows_what_is_stored(path):
     stored = nbformat.read(path, as_version=4)
     run = executed(nbformat.read(path, as_version=4), quick=True)
     for before, now in zip(code_cells(stored), code_cells(run), strict=True):
-        assert [has_picture(output) for output in now.outputs] == [has_picture(output) for output in before.outputs], (
-            now.id
-        )
+        pictured, expected = ([has_picture(output) for output in cell.outputs] for cell in (now, before))
+        assert pictured == expected, now.id
         if not before.metadata.get("tests", {}).get("varies"):
             assert printed(now) == printed(before), now.id
             pairs = zip(now.outputs, before.outputs, strict=True)

@@ -56,12 +56,7 @@ HIDDEN = {
 }
 EVERY_HIDDEN = pytest.mark.parametrize(("sizes", "hidden"), HIDDEN.values(), ids=HIDDEN)
 # plugin/MATHEMATICS.md, section 6: scheme, valence, defective eigenvalue, its algebraic and its geometric multiplicity.
-DEFECTIVE = [
-    ("loop", 3, 1 / 16, 3, 2),
-    ("doo_sabin", 5, 1 / 4, 4, 2),
-    ("doo_sabin", 6, 1 / 4, 5, 3),
-    ("doo_sabin", 8, 1 / 4, 7, 5),
-]
+DEFECTIVE = [("loop", 3, 1 / 16, 3, 2), *(("doo_sabin", n, 1 / 4, n - 1, n - 3) for n in (5, 6, 8))]
 
 
 @pytest.mark.core

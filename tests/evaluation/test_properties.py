@@ -1,5 +1,3 @@
-"""Laws of evaluation: what maps and numbers of the cage do to the surface."""
-
 import numpy as np
 import pytest
 from kernels.surfaces import SURFACES, random_locations, surface_named

@@ -1,5 +1,3 @@
-"""What `LimitSurface` accepts and refuses."""
-
 import numpy as np
 import pytest
 from kernels.surfaces import SURFACES, surface_named

@@ -1,5 +1,3 @@
-"""Gradients of outlines are those of the area that triangles cover, which scan lines measure without a renderer."""
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

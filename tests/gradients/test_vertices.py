@@ -1,5 +1,3 @@
-"""Derivatives of a tessellation in double precision: forward, reverse, and differences of another evaluation agree."""
-
 import sys
 
 import numpy as np
@@ -38,7 +36,6 @@ def on_host(table, positions, matrix):
 
 
 def extrapolated(function):
-    """Derivative at zero."""
 
     def central(step):
         return [(a - b) / (2 * step) for a, b in zip(function(step), function(-step), strict=True)]

@@ -24,7 +24,6 @@ def test_next_and_prev_walk_the_vertices_of_each_face_in_order(any_cage):
 
 
 def test_turns_pass_the_edge_before_and_back_the_edge_after(any_cage):
-    """On borders there is nothing beyond."""
     t = any_cage.topology
     for half_edge in range(t.half_edge_count):
         ahead, behind = t.twin[t.prev[half_edge]], t.twin[half_edge]

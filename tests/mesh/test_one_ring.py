@@ -15,7 +15,6 @@ TOPOLOGIES = {name: make().topology for name, make in CLOSED_CAGES.items()} | PI
 
 
 def half_edges_of(topology, most=80):
-    """Some of them, all over the mesh."""
     count = topology.half_edge_count
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)).tolist()
 
@@ -29,7 +28,6 @@ EVERY_KIND = pytest.mark.parametrize("kind", ["face", "vertex"])
 
 
 def gathered(ring, topology, half_edges):
-    """All at once, as some of them are."""
     table = RingTable(topology, [ring], np.array(half_edges), np.array([len(half_edges)]))
     index = np.arange(len(half_edges))
     (some,) = table.vertices_of(0 * index, index)
@@ -87,7 +85,6 @@ def test_gathered_ring_is_a_map_of_meshes(topology, kind):
 @by_name(WITH_SHEETS)
 @EVERY_KIND
 def test_many_elements_gather_as_each_alone(topology, kind, monkeypatch):
-    """Some of them at a time."""
     monkeypatch.setattr(ragged, "CHUNK_LENGTH", 3)
     classes = {}
     for half_edge in range(topology.half_edge_count):

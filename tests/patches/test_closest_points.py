@@ -145,9 +145,7 @@ def test_distances_that_count_as_convex_are_no_more_than_means_in_the_middle(np_
 
 def test_bounds_around_extraordinary_points_move_with_them():
     cage = surface_named("mixed torus").cage
-    here, there = (
-        LimitSurface(cage.with_positions(cage.positions + away))._surface_pieces.tips for away in (0.0, 64.0)
-    )
+    here, there = (LimitSurface(cage.with_positions(cage.positions + away))._surface_pieces.tips for away in (0, 64))
     for one, other in zip(here, there, strict=True):
         np.testing.assert_allclose(one.reach(2), other.reach(2), rtol=1e-9)
 

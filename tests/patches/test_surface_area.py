@@ -1,5 +1,3 @@
-"""Areas: closed forms, fine triangles, and what scaling and refinement do to them."""
-
 import numpy as np
 import pytest
 from kernels.surfaces import surface_named

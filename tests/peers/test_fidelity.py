@@ -70,7 +70,6 @@ EVERY_ISLAND = pytest.mark.parametrize("cage", ISLANDS.values(), ids=ISLANDS)
 
 
 def at(cage, sampling, count):
-    """Samples that are not on holes."""
     element, uv, corner = sampling(cage, *count)
     there = ~cage.is_hole[element]
     return element[there], uv[there], corner[there]
@@ -192,7 +191,6 @@ def test_face_varying_values(cage):
 
 
 def _apart(ours, theirs, element):
-    """The faces on which surfaces differ."""
     return set(element[distance(ours.p, theirs.p) > POINT].tolist())
 
 

@@ -1,5 +1,3 @@
-"""Scenes against their references, and what the tiers see of defects put in on purpose."""
-
 from dataclasses import replace
 
 import mitsuba as mi
@@ -53,7 +51,6 @@ def test_defects_are_caught(reference, valence, name):
 
 @pytest.mark.parametrize("valence", [3], indirect=True)
 def test_the_tile_tier_is_sure_of_one_per_cent_and_of_nothing(reference, valence):
-    """At the usual 256 samples."""
     for seed, load, status in ((0, scene_of, Status.PASS), (1, brighter, Status.FAIL)):
         result = compare(reference, render_like(reference, load(valence), seed=seed), ["tile"])
         assert result.status is status, str(result)

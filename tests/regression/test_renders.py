@@ -1,5 +1,3 @@
-"""Renders: scenes, images in parts and in passes, here and on a cluster; the same command gives the same image."""
-
 import os
 import subprocess
 import sys
@@ -284,9 +282,7 @@ def frame_after_a_death(frame, marker, command, number):
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
-def test_frames_passes_and_references_have_the_bits_of_one_machine_although_a_worker_dies(
-    tmp_path, monkeypatch, capsys
-):
+def test_a_cluster_gives_the_bits_of_one_machine_although_a_worker_dies(tmp_path, monkeypatch, capsys):
     distributed = pytest.importorskip("distributed")
     (tmp_path / "model.usda").write_text(MODEL)
     monkeypatch.chdir(tmp_path)

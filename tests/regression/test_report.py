@@ -1,5 +1,3 @@
-"""The report: its page, and the picture on it."""
-
 import base64
 import io
 import json
@@ -58,7 +56,6 @@ def by_title(figure):
 
 
 def drawn(comparison, monkeypatch):
-    """The panels of a report, by their titles."""
     figures = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
     report._panels(comparison)

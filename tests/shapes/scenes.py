@@ -38,7 +38,6 @@ def down(x=0.1, y=0.2, z=5):
 
 
 def hit(shape, *place):
-    """Of a ray from above."""
     return scene_with(shape=shape).ray_intersect(down(*place))
 
 

@@ -1,5 +1,3 @@
-"""Shapes whose virtual functions are answered in Python: errors inside, lifetimes, variants, threads, and platforms."""
-
 import contextlib
 import gc
 import itertools
@@ -62,7 +60,6 @@ def raises_answer(kind=AnswerError):
 
 
 def complete_by(monkeypatch, function):
-    """Have interactions completed by another function than that of exact shading."""
     monkeypatch.setattr(exact_shading.ExactShading, "complete", function)
 
 
@@ -263,7 +260,6 @@ def instance(group, place):
 
 
 def shapes_of(number, count, within=None):
-    """Cubes above each other, and other shapes."""
     place = (within or mi.ScalarTransform4f()).translate
     shapes = {f"m{number}_{k}": cube(to_world=place([0, 0, 2 * k]).scale(1 + 0.1 * number)) for k in range(count)}
     shapes[f"flat{number}"] = {"type": "rectangle", "to_world": place([0, 0, -2]).scale(0.5)}

@@ -1,5 +1,3 @@
-"""The plugin is there in every variant, in any order of import and `set_variant`; exact shading, where it works."""
-
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -88,10 +86,8 @@ def test_equal_shapes_of_a_scene_stay_two_and_can_be_written_as_xml():
     scene = scene_with(m={"type": "diffuse", "id": "m"}, a=shape, b=shape, c={**shape, **aside})
     assert sorted(shape.id() for shape in scene.shapes()) == ["a", "b", "c"]
     # Whether or not objects of a scene are merged.
-    assert (
-        len(mi.load_dict({"type": "scene", "a": described(cube()), "b": described(cube())}, optimize=False).shapes())
-        == 2
-    )
+    equal = {"type": "scene", "a": described(cube()), "b": described(cube())}
+    assert len(mi.load_dict(equal, optimize=False).shapes()) == 2
     parameters = mi.traverse(scene)
     update(parameters, {"a.control_points": parameters["a.control_points"] * 2})
     a, c = (scene.ray_intersect(down(x, 0.1, 9)) for x in (0.1, 4.1))
