@@ -10,15 +10,11 @@ reach a few levels only, beside the limit point and normal by closed form.
 
 import argparse
 import sys
-import time
 import warnings
 
 import numpy as np
 from evaluation.common import BARS, largest_errors
 from mitsuba_subdivision import LimitSurface
-from mitsuba_subdivision.evaluation import element, irregular_patch, patch_tree
-from mitsuba_subdivision.mesh import one_ring
-from mitsuba_subdivision.mesh.signature import signatures_at
 from reference import bars
 from reference.exact_samples import SCHEMES, ExactSamples, angle, samples_at
 
@@ -26,24 +22,8 @@ VALENCES = (*range(3, 13), 20, 50, 100)
 HIGH_VALENCES = (200, 500, 1000)
 HIGH_LEVELS = (0, 2, 6)
 
-# Column of the table, and the bar of the value there; None where there is none.
-COLUMNS = {**BARS, "point f32": bars.POINT_FLOAT32, "normal f32": bars.NORMAL_FLOAT32, "build ms": None}
-
-
-def build_time(surface: LimitSurface) -> float:
-    """Milliseconds to prepare the class of element 0 from nothing, its pieces and eigenbasis; the best of three."""
-    half_edges = surface.patches.half_edge_of_corner[:1]
-    (signature,) = signatures_at(surface.cage.topology, half_edges, surface.scheme.element)
-    times = []
-    for _ in range(3):
-        for module in (one_ring, patch_tree, element, irregular_patch):
-            for function in vars(module).values():
-                if hasattr(function, "cache_clear"):
-                    function.cache_clear()
-        begin = time.perf_counter()
-        element.element_stencils(surface.scheme, signature, np.array([[0.1, 0.1]]))
-        times.append(1e3 * (time.perf_counter() - begin))
-    return min(times)
+# Column of the table, and the bar of the value there.
+COLUMNS = {**BARS, "point f32": bars.POINT_FLOAT32, "normal f32": bars.NORMAL_FLOAT32}
 
 
 def errors(exact: ExactSamples, surface: LimitSurface) -> dict[str, float]:
@@ -72,18 +52,16 @@ def main() -> int:
         for valence in HIGH_VALENCES if high else (*((2,) if scheme == "catmull_clark" else ()), *VALENCES):
             exact = samples_at(scheme, valence, HIGH_LEVELS) if high else samples_at(scheme, valence)
             surface = LimitSurface(exact.cage, scheme)
-            row = {"build ms": build_time(surface), **errors(exact, surface)}
+            row = errors(exact, surface)
             for name, error in row.items():
                 if name != "normal f32" or valence <= bars.NORMAL_FLOAT32_VALENCES:
                     # A not-a-number, too, must count as a failure.
                     worst[name] = max(worst.get(name, 0.0), float(np.nan_to_num(error, nan=np.inf)))
-            cells = (f"{row[name]:12.1f}" if name == "build ms" else _number(row.get(name)) for name in COLUMNS)
-            print(f"{scheme:14}{valence:6}" + "".join(cells), flush=True)
-    bars_of = {name: bar for name, bar in COLUMNS.items() if bar is not None}
-    print(f"{'largest':20}" + "".join(_number(worst.get(name)) for name in bars_of))
-    print(f"{'bar':20}" + "".join(map(_number, bars_of.values())))
-    failed = [name for name, bar in bars_of.items() if name in worst and not worst[name] <= bar]
-    held = [name for name in bars_of if name in worst and name not in failed]
+            print(f"{scheme:14}{valence:6}" + "".join(_number(row.get(name)) for name in COLUMNS), flush=True)
+    print(f"{'largest':20}" + "".join(_number(worst.get(name)) for name in COLUMNS))
+    print(f"{'bar':20}" + "".join(map(_number, COLUMNS.values())))
+    failed = [name for name, bar in COLUMNS.items() if name in worst and not worst[name] <= bar]
+    held = [name for name in COLUMNS if name in worst and name not in failed]
     print(f"(above valence {bars.NORMAL_FLOAT32_VALENCES} normal f32 is not judged)")
     print(f"bars that hold: {', '.join(held) or 'none'}; bars that do not: {', '.join(failed) or 'none'}")
     return 1 if failed else 0

@@ -127,12 +127,7 @@ def idiff(reference: Image, test: Image) -> bool:
     return subprocess.run([*IDIFF, reference.name, test.name], capture_output=True, check=False).returncode == 2
 
 
-RULES = {
-    "tile": partial(fails, "tile"),
-    "Mitsuba": mitsuba_z_test,
-    "FLIP": partial(fails, "flip"),
-    "idiff": idiff,
-}
+RULES = {"tile": partial(fails, "tile"), "Mitsuba": mitsuba_z_test, "FLIP": partial(fails, "flip"), "idiff": idiff}
 
 
 def main() -> None:

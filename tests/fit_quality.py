@@ -92,8 +92,6 @@ MESH_COURSES = {
 
 
 class Triangles(NamedTuple):
-    """A mesh with normals."""
-
     positions: np.ndarray
     normals: np.ndarray
     triangles: np.ndarray
@@ -187,7 +185,6 @@ def from_cage(name: str) -> Triangles:
 
 
 def from_ball(moved: Callable[[np.ndarray], np.ndarray]) -> Triangles:
-    """A smooth image of the unit sphere."""
     ball = ball_cage(7, 1.0)
     return Triangles.averaged(moved(ball.positions), ball.triangles)
 
@@ -230,7 +227,6 @@ def ball_cage(halvings: int, radius: float) -> msub.ControlCage:
 
 
 def mesh_shape(mesh: Triangles) -> mi.Mesh:
-    """A mesh for a scene, smoothly shaded."""
     buffers = {"vertex_positions": mesh.positions}
     return mitsuba_mesh("mesh", mesh.triangles, buffers, bsdf=mi.load_dict(BSDF), averages_normals=True)
 
@@ -253,23 +249,12 @@ def pictures(target: Triangles, spp: int = TARGET_SPP) -> list[View]:
 
 def fitted_cage(target: Triangles, views: list[View], course: Course, seed: int, steps: int) -> Result:
     clock = [time.perf_counter()]
-    fit = CageFit(
-        ball_cage(COARSE, RADIUS * DIAGONAL),
-        views,
-        STAGE,
-        shape={"bsdf": BSDF},
-        learning_rate=course.schedule(steps),
-        smoothing=LAMBDA,
-        regularizers={
-            "bending": course.schedule(steps, course.bending),
-            "folds": [(steps // 4 + 1, 0), (steps, FOLDS)],
-        },
-        refine=[steps // 4],
-        spp=SPP,
-        edge_spp=EDGE_SPP,
-        seed=1000 * seed,
-        callbacks=[lambda _: clock.append(time.perf_counter())],
-    ).run(steps)
+    folds = [(steps // 4 + 1, 0), (steps, FOLDS)]
+    options = {"shape": {"bsdf": BSDF}, "refine": [steps // 4], "spp": SPP, "edge_spp": EDGE_SPP, "seed": 1000 * seed}
+    options |= {"learning_rate": course.schedule(steps), "smoothing": LAMBDA}
+    options["regularizers"] = {"bending": course.schedule(steps, course.bending), "folds": folds}
+    options["callbacks"] = [lambda _: clock.append(time.perf_counter())]
+    fit = CageFit(ball_cage(COARSE, RADIUS * DIAGONAL), views, STAGE, **options).run(steps)
     return compared(Triangles.of_surface(fit.cage, 8), target, fit.cage.positions.size, np.diff(clock))
 
 
@@ -312,19 +297,12 @@ def fitted_creases(seed: int) -> tuple[float, float, float]:
     sharpness = np.array([1.5, 0.8, 2.3])[(start.positions[start.edges, 2] > 0).sum(axis=1)]
     box = tagged(start, sharpness).with_positions(start.positions * (1.1, 1.0, 0.9))
     views, peaks = pictures(Triangles.of_surface(box, 32), CREASE_TARGET_SPP), []
-    fit = CageFit(
-        tagged(start, np.full(len(sharpness), CREASE_START)),
-        views,
-        STAGE,
-        shape={"bsdf": BSDF, "tessellation_rate": 16},
-        sharp_edges=start.edges,
-        smoothing=0,
-        learning_rate=[(0, 0.03), (CREASE_STEPS / 2, 0.03), (CREASE_STEPS, 0.001)],
-        sharpness_rate=[(0, 0.3), (CREASE_STEPS / 2, 0.3), (CREASE_STEPS, 0.02)],
-        spp=CREASE_SPP,
-        seed=1000 * seed,
-        callbacks=[lambda _: peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)],
-    ).run(CREASE_STEPS)
+    options = {"shape": {"bsdf": BSDF, "tessellation_rate": 16}, "spp": CREASE_SPP, "seed": 1000 * seed, "smoothing": 0}
+    options["learning_rate"] = [(0, 0.03), (CREASE_STEPS / 2, 0.03), (CREASE_STEPS, 0.001)]
+    options["sharpness_rate"] = [(0, 0.3), (CREASE_STEPS / 2, 0.3), (CREASE_STEPS, 0.02)]
+    options["callbacks"] = [lambda _: peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)]
+    box_of_creases = tagged(start, np.full(len(sharpness), CREASE_START))
+    fit = CageFit(box_of_creases, views, STAGE, sharp_edges=start.edges, **options).run(CREASE_STEPS)
     errors = np.abs(fit.sharpness - sharpness)
     return errors.mean(), errors.max(), (peaks[-1] - peaks[50]) / 1024
 

@@ -137,9 +137,7 @@ class Outlines:
         scene = mi.load_dict({"type": "scene", "mesh": mesh})
         is_free = np.full(len(points), False)
         for side in (BESIDE * self.pixel, -BESIDE * self.pixel):
-            directions = mi.Vector3f(
-                *(upload(mi.Float, column) for column in (seen + side * beside).T.astype(np.float32))
-            )
+            directions = upload(mi.Vector3f, seen + side * beside)
             is_free |= ~np.array(scene.ray_test(mi.Ray3f(mi.Point3f(*self.eye.tolist()), directions)))
         forward = self.target - self.eye
         right = np.cross(forward, [0, 0, 1])

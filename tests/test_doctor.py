@@ -1,5 +1,3 @@
-"""What `doctor` says of the machine, and of what does not work on it."""
-
 import json
 import os
 import sys

@@ -1,5 +1,3 @@
-"""Files that come with the package."""
-
 from pathlib import Path
 
 import pytest

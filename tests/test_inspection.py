@@ -1,5 +1,3 @@
-"""What `info` says of cages."""
-
 import json
 
 import numpy as np
@@ -65,10 +63,8 @@ def test_seams_and_pieces_are_counted():
     seams, age = Attribute(np.zeros((48, 2)), "face_varying"), Attribute(np.zeros((16, 1)))
     inspected = inspect(LimitSurface(ControlCage(positions, faces, texcoords=seams, attributes={"age": age})))
     assert inspected["component_count"] == 2
-    assert inspected["attributes"] == {
-        "texcoords": "face-varying with 24 seam edges, rule corners_plus1",
-        "age": "vertex",
-    }
+    texcoords = "face-varying with 24 seam edges, rule corners_plus1"
+    assert inspected["attributes"] == {"texcoords": texcoords, "age": "vertex"}
 
 
 # Of another sharpness each, so that all patches differ, and refinement has to follow them far down.

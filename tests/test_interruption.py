@@ -1,5 +1,3 @@
-"""Ctrl-C ends commands at once, with a line, the right status and no file."""
-
 import fcntl
 import os
 import shutil

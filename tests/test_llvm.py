@@ -78,9 +78,7 @@ def test_version_by_name(tmp_path, name, version):
         assert llvm.library_version(tmp_path / "libLLVM") == version
 
 
-@pytest.mark.parametrize(
-    ("modules", "libraries"), [("lib/python3.11/site-packages", "lib"), ("packages", "packages/lib")]
-)
+@pytest.mark.parametrize(("modules", "libraries"), [("lib/python3/site-packages", "lib"), ("packages", "packages/lib")])
 def test_libraries_of_a_wheel_are_found_where_its_packages_are(monkeypatch, tmp_path, modules, libraries):
     """In an environment, and in a folder that `pip install --target` names."""
     for folder in (modules, libraries):
@@ -113,7 +111,7 @@ def test_a_folder_with_a_star_stands_for_all_whose_names_begin_so(tmp_path):
         (["libLLVM.so.19.1"], [], "x86_64", llvm.NO_USABLE_LLVM, 19),
     ],
 )
-def test_a_usable_library_of_python_comes_before_the_newest_of_the_system(
+def test_libraries_of_python_come_before_those_of_the_system(
     fresh, monkeypatch, python, system, machine, setting, version
 ):
     for folder, names in zip(fresh, (python, system), strict=True):

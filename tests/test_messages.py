@@ -94,13 +94,6 @@ def test_wrong_values_are_told(capsys, words, message):
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("folder")
-def test_saving_into_a_missing_folder_is_told_by_its_name():
-    for suffix in ("ply", "usda"):
-        with pytest.raises(FileNotFoundError, match=f'^"missing/cube.{suffix}": there is no folder "missing"$'):
-            cube().save(f"missing/cube.{suffix}")
-
-
 NEEDS_PASSES = "--batch is for passes; expected --pass, --passes, --dask or --reference beside it"
 NO_NOISE = "--denoise removes the noise that passes and references measure; expected no --pass"
 ROOK = example_file("rook.xml")

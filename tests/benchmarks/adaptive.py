@@ -49,7 +49,6 @@ def _error(word):
 
 
 def _show(model, scheme, error, options):
-    """One row of the table; each side is measured in a process of its own."""
     uniform = measured(tessellations, model, scheme, None, options.rate)
     adaptive = measured(tessellations, model, scheme, error, None)
     beyond = adaptive["seconds"] - (2 * uniform["seconds"] if options.rate == 1 else 0)

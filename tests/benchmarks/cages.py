@@ -16,13 +16,11 @@ ICOSAHEDRON = np.block([[SHORT, 0 * LONG, LONG], [LONG, SHORT, 0 * LONG], [0 * L
 
 
 def cube():
-    """Six quadrilaterals, every corner of valence 3."""
     cage = named_cages.cube()
     return cage.positions, cage.face_vertices.reshape(-1, 4)
 
 
 def torus(n=256):
-    """Regular everywhere."""
     i, j = np.divmod(np.arange(n * n), n)
     u, v = 2 * np.pi * i / n, 2 * np.pi * j / n
     radius = 1 + 0.4 * np.cos(v)

@@ -37,7 +37,6 @@ def main():
 
 
 def compare(cage, files, folder, options):
-    """Measure and show medians of each stage for both shapes, in turns."""
     import os
     import statistics
 

@@ -144,13 +144,11 @@ def picture(files, rate, _folder, variant):
 
 
 def computed(arrays):
-    """Arrays of Dr.Jit that are in memory."""
     dr.eval(arrays)
     dr.sync_thread()
     return arrays
 
 
 def finish(shape):
-    """Wait for all that the shape has started."""
     shape.bbox()
     dr.sync_thread()

@@ -93,5 +93,4 @@ def ran(words, **variables):
 
 
 def print_row(name, *cells, width=20):
-    """A row of a table, or its head."""
     print(f"{name:<50}" + "".join(f"{cell:>{width}}" for cell in cells), flush=True)

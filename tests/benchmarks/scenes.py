@@ -51,10 +51,8 @@ def main():
     for name in options.tasks or TASKS:
         (work, cases), taken = TASKS[name], []
         for words in cases(options):
-            runs = {
-                shading: measured_from_empty_cache(work, shading, options.repeats, *words, times=2)
-                for shading in SHADINGS
-            }
+            given = options.repeats, *words
+            runs = {shading: measured_from_empty_cache(work, shading, *given, times=2) for shading in SHADINGS}
             taken.append(runs)
             _show(f"{name} {' '.join(map(str, words))}", runs)
         if work is shapes:
@@ -181,7 +179,6 @@ TASKS = {
 
 
 def _pictures(clock, scene, repeats):
-    """A scene, loaded, and pictures of it."""
     clock.lap()
     loaded = mi.load_dict(scene)
     dr.sync_thread()

@@ -1,5 +1,3 @@
-"""The benchmarks run; what they measure is for people to read, not for tests."""
-
 import json
 import re
 import shutil
@@ -7,7 +5,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from benchmarks.peers import time_peer
 from benchmarks.processes import ran
 from mitsuba_subdivision.llvm import llvm_problem
 
@@ -19,7 +16,6 @@ needs_llvm = pytest.mark.skipif(llvm_problem() is not None, reason=str(llvm_prob
 
 
 def said(*words):
-    """What a program of this folder prints."""
     done = ran([sys.executable, *words])
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -51,26 +47,6 @@ def test_other_benchmarks_run(words, expected):
     assert "failed" not in printed
 
 
-def test_a_stage_without_materials_has_all_else(tmp_path, monkeypatch):
-    usd = pytest.importorskip("pxr.Usd")
-    monkeypatch.syspath_prepend(HERE)
-    from whole_stage import without_materials
-
-    path = tmp_path / "quads.usda"
-    binding = '(prepend apiSchemas = ["MaterialBindingAPI"]) {\n    rel material:binding = </red>'
-    text = STAGE.read_text().replace("#usda 1.0", '#usda 1.0\n(\n    upAxis = "Z"\n)\ndef Material "red" {\n}')
-    path.write_text(text.replace('"quads" {', f'"quads" {binding}'))
-    given = usd.Stage.Open(str(path))
-    grey = usd.Stage.Open(str(without_materials(path, tmp_path / "grey.usda")))
-    assert [prim.GetName() for prim in given.Traverse()] == ["red", "quads"]
-    assert [prim.GetName() for prim in grey.Traverse()] == ["quads"]
-    quads = [stage.GetPrimAtPath("/quads") for stage in (given, grey)]
-    assert [len(mesh.GetRelationship("material:binding").GetTargets()) for mesh in quads] == [1, 0]
-    assert grey.GetMetadata("upAxis") == given.GetMetadata("upAxis") == "Z"
-    points, expected = (mesh.GetAttribute("points").Get() for mesh in quads)
-    assert points == expected
-
-
 @needs_llvm
 def test_a_whole_stage_is_measured_without_cycles(tmp_path):
     pytest.importorskip("pxr")
@@ -85,11 +61,3 @@ def test_a_whole_stage_is_measured_without_cycles(tmp_path):
     (ratios,) = re.findall("exact / vertex: (.*)", printed)
     stages = [re.sub(r" [0-9.]+ \(CPU [0-9.]+\)$", "", ratio) for ratio in ratios.split(", ")]
     assert stages == ["program to picture", "file to picture", "next picture"]
-
-
-@pytest.mark.parametrize(
-    ("program", "reason"),
-    [("kill -9 $$", "ended by SIGKILL"), ("echo no cage >&2; exit 3", "no cage"), ("exit 3", "exit status 3")],
-)
-def test_a_peer_that_fails_says_why(program, reason):
-    assert time_peer(["sh", "-c", program], "cage.bin", 8, 1) == {"failed": reason}

@@ -1,5 +1,3 @@
-"""Cages of arrays, files and attributes, their contents, edges, triangles and Laplacian; and named ones."""
-
 import dataclasses
 from collections import Counter
 from functools import cached_property
@@ -68,8 +66,6 @@ def test_inputs_are_copied():
 
 
 class NamedCage(ControlCage):
-    """A user's own class, with a value of its own."""
-
     label: str = "none"
 
     @cached_property
@@ -248,15 +244,6 @@ def are_corners_convex(cage):
     corners = cage.positions[cage.face_vertices.reshape(-1, 4)]
     before, after = np.roll(corners, 1, axis=1), np.roll(corners, -1, axis=1)
     return (np.einsum("fki,fki->fk", corners, np.cross(corners - before, after - corners)) > 0).all()
-
-
-def test_cube():
-    cage = cube()
-    assert (cage.vertex_count, cage.face_count) == (8, 6)
-    assert set(map(tuple, np.abs(cage.positions))) == {(1, 1, 1)}
-    assert (cage.topology.twin >= 0).all()
-    assert (cage.topology.vertex_face_count == 3).all()
-    assert are_corners_convex(cage)
 
 
 def test_less_than_three_faces_around_a_vertex_are_an_error():

@@ -1,5 +1,3 @@
-"""What cages refuse and warn of: points, faces, creases and corners; and how messages name them."""
-
 import _thread
 import re
 import time

@@ -21,12 +21,10 @@ def read(path):
 
 
 def without_blocks(text):
-    """Without blocks of code and diagrams."""
     return re.sub(r"^ *```.*?^ *```", "", text, flags=re.MULTILINE | re.DOTALL)
 
 
 def quoted(text):
-    """What stands between backticks."""
     return re.findall(r"`([^`\n]+)`", text)
 
 

@@ -37,19 +37,14 @@ def alike(one, other):
     return one.size == other.size and np.abs(blocks(one) - blocks(other)).max() < SHADE
 
 
-def test_there_are_three():
-    assert [path.stem for path in NOTEBOOKS] == ["dark_spot", "first_picture", "fitting"]
-
-
 @EVERY_NOTEBOOK
 def test_a_notebook_runs_and_shows_what_is_stored(path):
     """With fewer samples and steps. What these change, or the processor by its rounding, is marked as "varies"."""
     stored = nbformat.read(path, as_version=4)
     run = executed(nbformat.read(path, as_version=4), quick=True)
     for before, now in zip(code_cells(stored), code_cells(run), strict=True):
-        assert [has_picture(output) for output in now.outputs] == [has_picture(output) for output in before.outputs], (
-            now.id
-        )
+        pictured, expected = ([has_picture(output) for output in cell.outputs] for cell in (now, before))
+        assert pictured == expected, now.id
         if not before.metadata.get("tests", {}).get("varies"):
             assert printed(now) == printed(before), now.id
             pairs = zip(now.outputs, before.outputs, strict=True)
@@ -76,13 +71,3 @@ def test_fractions_in_the_text_of_a_notebook_come_from_its_cells(path):
     text = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "markdown")
     text = re.sub(r"\$.*?\$|\]\(.*?\)|^\[\d+\]: .*$", "", text, flags=re.MULTILINE)
     assert [number for number in FRACTION.findall(text) if number not in shown] == []
-
-
-def test_a_picture_with_the_dark_spot_is_not_like_one_without():
-    notebook = nbformat.read(FOLDER / "dark_spot.ipynb", as_version=4)
-    (spot,) = (picture(cell.outputs[0]) for cell in notebook.cells if cell.id == "spot")
-    side = spot.height // 2
-    for top in (0, side):
-        stam, stabilized, limit = (spot.crop((x, top, x + side, top + side)) for x in (0, side, 2 * side))
-        assert alike(stabilized, limit)
-        assert not alike(stam, limit)

@@ -92,19 +92,6 @@ def test_every_source_that_is_cited_is_in_the_bibliography():
     assert cited | on_pages == bibliography()
 
 
-@pytest.mark.parametrize(
-    ("text", "keys"),
-    [
-        ("as in [Loop 1987].", {"Loop 1987"}),
-        ("[DeRose et al. 1998, section\n    3; Hoppe et al. 1994]", {"DeRose et al. 1998", "Hoppe et al. 1994"}),
-        ("# by [Stam\n# 1998b, appendix A]", {"Stam 1998b"}),
-        ("values[1978], [1987], table[Name, 1978:]", set()),
-    ],
-)
-def test_citations_are_found(text, keys):
-    assert citations(text) == keys
-
-
 def test_the_table_of_eigenvalues_is_what_the_rules_give():
     rows = rows_below(MATHEMATICS, "eigenvalues")
     assert {row[0] for row in rows} == {"catmull_clark", "loop", "doo_sabin"}

@@ -1,63 +1,19 @@
-"""What is said of the project in more than one place is the same in all: versions, systems, commands, links."""
+"""The package as indexes show it: links of its long description, and its metadata."""
 
 import re
 import runpy
 
 import mitsuba_subdivision
 import pytest
-import yaml
 from documents.pages import PROJECT, ROOT, read, without_blocks
 
-VERSION = mitsuba_subdivision.__version__
-# Systems by the names that images of workflows begin with, and by those of classifiers.
-SYSTEMS = {"ubuntu": "POSIX :: Linux", "macos": "MacOS", "windows": "Microsoft :: Windows"}
+pytest.importorskip("hatchling")
+
 REPOSITORY = "https://github.com/someone/something"
-
-
-def workflow():
-    return yaml.safe_load(read(".github/workflows/tests.yml"))
-
-
-def classified(topic):
-    return {line.removeprefix(topic) for line in PROJECT["classifiers"] if line.startswith(topic)}
-
-
-def requirement(package, extra=None):
-    lines = PROJECT["dependencies"] if extra is None else PROJECT["optional-dependencies"][extra]
-    (line,) = (line.removeprefix(package) for line in lines if line.startswith(package))
-    return line
-
-
-@pytest.mark.parametrize("job", ["tests", "try-packages"])
-def test_a_workflow_runs_on_all_systems_and_versions_that_the_package_is_for(job):
-    matrix = workflow()["jobs"][job]["strategy"]["matrix"]
-    versions = [version for version in classified("Programming Language :: Python :: ") if "." in version]
-    assert sorted(matrix["python"]) == sorted(versions)
-    least = min(matrix["python"], key=lambda version: int(version.partition(".")[2]))
-    assert PROJECT["requires-python"] == f">={least}"
-    assert f"With Python {least} or newer" in read("README.md")
-    assert {SYSTEMS[name.partition("-")[0]] for name in matrix["os"]} == classified("Operating System :: ")
-    assert any(name.startswith("ubuntu") and name.endswith("-arm") for name in matrix["os"])
-
-
-def test_packages_are_pinned_as_the_text_says():
-    pinned = re.compile(r"Mitsuba ([\d.]+) and Dr\.Jit ([\d.]+), which `pyproject\.toml` pins")
-    versions = pinned.search(read("plugin/ARCHITECTURE.md")).groups()
-    for package, version in zip(("mitsuba", "drjit"), versions, strict=True):
-        major, minor = map(int, version.split(".")[:2])
-        assert requirement(package) == f">={version},<{major}.{minor + 1}"
-
-
-def test_the_changelog_and_the_citation_have_the_version_and_its_day():
-    (day,) = re.findall(rf"^## {re.escape(VERSION)} - (\d{{4}}-\d\d-\d\d)$", read("CHANGELOG.md"), flags=re.MULTILINE)
-    citation = yaml.safe_load(read("CITATION.cff"))
-    assert (str(citation["version"]), str(citation["date-released"])) == (VERSION, day)
-    assert citation.get("repository-code") == PROJECT["urls"].get("Repository")
 
 
 def long_description(*words):
     """By the module that hatchling loads by its path."""
-    pytest.importorskip("hatchling")
     return runpy.run_path(str(ROOT / "plugin" / "long_description.py"))["long_description"](*words)
 
 
@@ -83,14 +39,12 @@ def test_links_of_the_long_description_work_on_a_package_index(repository):
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_the_metadata_of_the_package_is_as_it_is_stated():
-    pytest.importorskip("hatchling")
+def test_the_metadata_of_the_package_is_valid_and_has_the_long_description():
     from hatchling.metadata.core import ProjectMetadata
     from hatchling.plugin.manager import PluginManager
 
-    metadata = ProjectMetadata(str(ROOT), PluginManager())
+    version, metadata = mitsuba_subdivision.__version__, ProjectMetadata(str(ROOT), PluginManager())
     metadata.validate_fields()
+    assert metadata.version == version
     repository = PROJECT["urls"].get("Repository")
-    assert metadata.version == VERSION
-    assert metadata.core.readme == long_description(read("README.md"), repository, f"v{VERSION}")
-    assert all(url.startswith("https://") for url in metadata.core.urls.values())
+    assert metadata.core.readme == long_description(read("README.md"), repository, f"v{version}")

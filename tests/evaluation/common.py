@@ -1,5 +1,3 @@
-"""What several files of these tests share."""
-
 import numpy as np
 import pytest
 from mitsuba_subdivision.evaluation.patch_tree import irregular_patch, isolated_signature
@@ -18,13 +16,10 @@ BARS = {
     "curvature": bars.CURVATURE,
 }
 EVERY_SCHEME = pytest.mark.parametrize("scheme", SCHEMES)
-EVERY_SCHEME_OBJECT = pytest.mark.parametrize(
-    "scheme", [CatmullClark(), Loop(), DooSabin()], ids=lambda scheme: scheme.name
-)
+EVERY_SCHEME_OBJECT = pytest.mark.parametrize("scheme", [CatmullClark(), Loop(), DooSabin()], ids=lambda s: s.name)
 
 
 def inside(scheme, rng, count=300):
-    """Random places in the domain."""
     return rng.dirichlet(np.ones(scheme.domain.corner_count), count) @ scheme.domain.corners
 
 

@@ -1,5 +1,3 @@
-"""Fixtures of the tests of `evaluation`."""
-
 import pytest
 from mitsuba_subdivision import LimitSurface
 from reference.exact_samples import SCHEMES, ExactSamples, samples_at

@@ -8,7 +8,7 @@ import pytest
 from evaluation.common import EVERY_SCHEME, assert_exact, curvatures
 from mitsuba_subdivision import LimitSurface, SchemeError, limit_stencil
 from mitsuba_subdivision.cage.named_cages import extraordinary
-from patches.closed_cages import cage_of, torus
+from patches.closed_cages import cage_of
 from reference import bars
 from reference.bars import CURVATURE, DERIVATIVE, NORMAL, POINT, SECOND_DERIVATIVE
 from reference.brute_force import BruteForce, Sample
@@ -128,20 +128,6 @@ def test_any_element_and_corner_match_explicit_refinement(scheme, name, np_rng):
         error = np.abs(getattr(computed, field) - exact[field]) / np.abs(exact[field]).max(axis=-1, keepdims=True)
         assert error.max() <= 10 * (SECOND_DERIVATIVE if field.startswith("d2p") else DERIVATIVE)
     assert curvature_error(curvatures(computed), exact["curvature"].T).max() <= CURVATURE
-
-
-def test_a_torus_grid_is_a_bicubic_spline(np_rng):
-    cage, uv = torus(9, 7), np_rng.random((50, 2))
-    column, row = np_rng.integers(0, 9, 50), np_rng.integers(0, 7, 50)
-    samples = LimitSurface(cage).evaluate(column * 7 + row, uv)
-    step, grid = np.arange(-1, 3), cage.positions.reshape(9, 7, 3)
-    points = grid[(column + step[:, None, None]) % 9, (row + step[:, None]) % 7]
-    # Cardinal cubic B-splines from truncated powers.
-    t = uv.T - step[:, None, None]
-    weights = sum(c * np.maximum(t + 2 - k, 0) ** 3 for k, c in enumerate((1, -4, 6, -4, 1))) / 6
-    expected = np.einsum("is,js,ijsx->sx", weights[:, 0], weights[:, 1], points)
-    assert np.abs(samples.p - expected).max() <= POINT * 6
-    assert (samples.level == 0).all()
 
 
 def test_translation_changes_normals_by_no_more_than_rounding_the_cage_does(exact):

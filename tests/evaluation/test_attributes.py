@@ -7,7 +7,7 @@ from mitsuba_subdivision.cage.contents import Attribute
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.schemes import scheme_named
 from patches.closed_cages import bipyramid, prism, torus
-from peers.fidelity_cages import MODES, fan
+from peers.fidelity_cages import MODES, fan, grid, with_islands
 from reference.refined_cages import channel_of, half_disc, tagged
 from reference.refinement import refined
 
@@ -51,7 +51,6 @@ def creases_along(cage, half_edges, rng, sharpness):
 
 
 def random_tags(cage, rng, share, sharpness=(INFINITE,)):
-    """Sharp edges and vertices."""
     t = cage.topology
     corners = np.flatnonzero(rng.random(t.vertex_count) < share / 2)
     return {
@@ -89,9 +88,8 @@ def as_cage(points, texcoords, options):
     """Cage of points and texture coordinates that the reference has refined."""
     positions = {vertex: point for (vertex, _), point in points.values.items()}
     row = {key: i for i, key in enumerate(texcoords.values)}
-    keys = [
-        key for of_face in zip(texcoords.faces, texcoords.indices, strict=True) for key in zip(*of_face, strict=True)
-    ]
+    faces = zip(texcoords.faces, texcoords.indices, strict=True)
+    keys = [key for face in faces for key in zip(*face, strict=True)]
     return ControlCage(
         [positions[vertex] for vertex in range(len(positions))],
         points.faces,
@@ -112,34 +110,11 @@ def mixed(scheme, cage, mode):
     return np.random.default_rng(number), KINDS[number % 3], ("uniform", "chaikin")[number % 2]
 
 
-# Two refinements decay all of them. Beside 0.2, Chaikin's method ends 1.2 at once, of which more than one was left.
-# With half of the edges, some vertices are semi-sharp for less long than an edge on the other side of their seam.
-DECAYING = (0.2, 1, 1.2, 1.7)
-SHARP, SEMI_SHARP = (1, 0.1, (INFINITE,)), (2, 0.5, DECAYING)
-
-
-@pytest.mark.parametrize(
-    ("scheme", "cage", "mode", "refinements", "share", "sharpness"),
-    [
-        # Of both methods for creases, which alternate with cages and with modes.
-        (*cage, mode, *(SEMI_SHARP if (c // 2 + m) % 2 and mode != "all" else SHARP))
-        for c, cage in enumerate(CAGES.values())
-        for m, mode in enumerate(MODES)
-    ],
-    ids=[f"{name}-{mode}" for name in CAGES for mode in MODES],
-)
-def test_refinements_by_the_reference_have_the_same_points_and_values(
-    scheme, cage, mode, refinements, share, sharpness
-):
-    rng, kind, method = mixed(scheme, cage, mode)
-    options = {"boundary": str(rng.choice(["edge_and_corner", "edge_only"])), "face_varying": mode}
-    # As the reference states it; no triangles are left by a refinement.
-    options["triangle_rule"] = "smooth" if scheme == "catmull_clark" and rng.random() < 0.5 else "catmull_clark"
-    tags = random_tags(cage, rng, share, sharpness)
-    coarse = textured(cage, random_indices(cage, rng, kind), rng, **tags, **options, crease_method=method)
-    surface, domain = LimitSurface(coarse, scheme), scheme_named(scheme).domain
-    points = channel_of(coarse, coarse.positions, coarse.face_vertices)
-    texcoords = channel_of(coarse, coarse.texcoords.values, coarse.texcoords.indices, mode)
+def assert_refined_alike(cage, scheme, refinements, rng):
+    """The surface and texture coordinates are those of the cage that the reference has refined once or twice."""
+    surface, domain = LimitSurface(cage, scheme), scheme_named(scheme).domain
+    points = channel_of(cage, cage.positions, cage.face_vertices)
+    texcoords = channel_of(cage, cage.texcoords.values, cage.texcoords.indices, cage.face_varying)
     element, uv, corner = random_locations(surface, rng, 60)
     (points, child), (texcoords, _) = refined(points, scheme), refined(texcoords, scheme)
     place = [child[at] for at in zip(element, corner, strict=True)]
@@ -150,16 +125,54 @@ def test_refinements_by_the_reference_have_the_same_points_and_values(
         fine = rng.random((len(element), 2)) / (2 if domain.corner_count == 3 else 1)
         uv = np.stack([domain.rotation(k)(at / 2) for k, at in zip(second, fine, strict=True)])
         place = [child[at] for at in zip(place, second, strict=True)]
-    # Tags on a border are sharp with it.
-    assert {0, INFINITE}.issuperset([*points.creases.values(), *points.corners.values()])
     # A whole element's corner is an element at twice the parameters; that of another polygon is at its own.
     halved = (cage.face_sizes[element] == domain.corner_count)[:, None]
     here, there = (element, np.where(halved, uv / 2, uv), corner), (place, fine)
+    options = {rule: getattr(cage, rule) for rule in ("boundary", "face_varying", "crease_method")}
     finer = LimitSurface(as_cage(points, texcoords, options), scheme)
     size = np.abs(cage.positions).max()
     np.testing.assert_allclose(surface.evaluate(*here).p, finer.evaluate(*there).p, rtol=0, atol=ROUNDING * size)
     values, expected = surface.evaluate_attribute("texcoords", *here), finer.evaluate_attribute("texcoords", *there)
     np.testing.assert_allclose(values, expected, rtol=0, atol=ROUNDING)
+
+
+# Two refinements decay all of them. Beside 0.2, Chaikin's method ends 1.2 at once, of which more than one was left.
+# With half of the edges, some vertices are semi-sharp for less long than an edge on the other side of their seam.
+SHARP, SEMI_SHARP = (1, 0.1, (INFINITE,)), (2, 0.5, (0.2, 1, 1.2, 1.7))
+# Each lasts for a refinement more than what it becomes, down to those above.
+LASTING = 1, 0.3, (9.9, 9, 8.3, 7.6, 6.5, 5.2, 4.8, 3.7, 2.4, 1.7)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "cage", "mode", "refinements", "share", "sharpness"),
+    [
+        # Of both methods for creases, which alternate with cages and with modes.
+        *(
+            (*cage, mode, *(SEMI_SHARP if (c // 2 + m) % 2 and mode != "all" else SHARP))
+            for c, cage in enumerate(CAGES.values())
+            for m, mode in enumerate(MODES)
+        ),
+        *((*cage, mode, *LASTING) for cage in CAGES.values() for mode in MODES[:2]),
+    ],
+    ids=[*(f"{name}-{mode}" for name in CAGES for mode in MODES), *(f"{n}-lasting-{m}" for n in CAGES for m in "01")],
+)
+def test_reference_refinements_have_the_same_points_and_values(scheme, cage, mode, refinements, share, sharpness):
+    rng, kind, method = mixed(scheme, cage, mode)
+    options = {"boundary": str(rng.choice(["edge_and_corner", "edge_only"])), "face_varying": mode}
+    # As the reference states it; no triangles are left by a refinement.
+    options["triangle_rule"] = "smooth" if scheme == "catmull_clark" and rng.random() < 0.5 else "catmull_clark"
+    tags = random_tags(cage, rng, share, sharpness)
+    coarse = textured(cage, random_indices(cage, rng, kind), rng, **tags, **options, crease_method=method)
+    assert_refined_alike(coarse, scheme, refinements, rng)
+
+
+def test_semi_sharp_edges_hold_values_across_creases_but_not_semi_sharp_vertices_across_seams(np_rng):
+    """Copies of smooth vertices are held across seams, too, in the first mode: this one is sharp for less long."""
+    at_vertex = with_islands(fan(6, creases=[(0, 2, 1.7)], corners=[(0, 0.5)]), [(0, 1), (0, 4)], "corners_plus1")
+    crease, seam = ([(row + at, row + 5 + at) for row in range(0, 20, 5)] for at in (2, 1))
+    beside = grid(4, 4, creases=[*((*edge, INFINITE) for edge in crease), (12, 13, 1.7)])
+    for cage in (at_vertex, with_islands(beside, seam, "corners_only")):
+        assert_refined_alike(cage, "catmull_clark", 2, np_rng)
 
 
 # Laws

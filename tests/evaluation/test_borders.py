@@ -82,28 +82,6 @@ def test_signs_of_eigenvectors_do_not_matter(scheme, cage, np_rng, monkeypatch):
     assert angle(samples.n, expected.n).max() <= NORMAL
 
 
-def test_a_border_is_a_cubic_spline_between_its_corners():
-    cage = bumpy(sheet(3, 1))
-    t = np.linspace(0, 1, 9)
-    points = LimitSurface(cage).evaluate(1, np.stack([t, np.zeros_like(t)], axis=1)).p
-    a, b, c, d = cage.positions[:4]
-    s = 1 - t
-    weights = np.stack([s**3, 3 * t**3 - 6 * t**2 + 4, 3 * s**3 - 6 * s**2 + 4, t**3]) / 6
-    assert np.abs(points - weights.T @ [a, b, c, d]).max() <= POSITION
-
-
-def test_a_crease_has_one_position_and_two_normals():
-    cage = tagged(cube(), creases=[(4, 5, INFINITE), (5, 7, INFINITE), (7, 6, INFINITE), (6, 4, INFINITE)])
-    t, along = cage.topology, np.linspace(0, 1, 7)
-    (half_edge,) = np.flatnonzero((t.face_vertices == 4) & (t.face_vertices[t.next] == 5))
-    one, other = (
-        evaluate_from(LimitSurface(cage), side, np.stack([u, 0 * u], axis=1))
-        for side, u in ((half_edge, along), (t.twin[half_edge], 1 - along))
-    )
-    assert np.abs(one.p - other.p).max() <= POSITION
-    assert angle(one.n, other.n).min() > 10
-
-
 def test_a_corner_of_two_triangles_is_touched_by_the_plane_of_its_border_edges():
     """The edge between the two triangles contracts faster, so the plane need not hold it."""
     corner, first, middle, last = np.array([(0, 0, 0), (1, 0, 0.1), (0.8, 0.9, 0.7), (-0.1, 1, 0.2)])

@@ -56,12 +56,7 @@ HIDDEN = {
 }
 EVERY_HIDDEN = pytest.mark.parametrize(("sizes", "hidden"), HIDDEN.values(), ids=HIDDEN)
 # plugin/MATHEMATICS.md, section 6: scheme, valence, defective eigenvalue, its algebraic and its geometric multiplicity.
-DEFECTIVE = [
-    ("loop", 3, 1 / 16, 3, 2),
-    ("doo_sabin", 5, 1 / 4, 4, 2),
-    ("doo_sabin", 6, 1 / 4, 5, 3),
-    ("doo_sabin", 8, 1 / 4, 7, 5),
-]
+DEFECTIVE = [("loop", 3, 1 / 16, 3, 2), *(("doo_sabin", n, 1 / 4, n - 1, n - 3) for n in (5, 6, 8))]
 
 
 @pytest.mark.core
@@ -167,18 +162,14 @@ def test_scaled_powers_are_matrix_powers(sizes, hidden, place):  # noqa: ARG001
     np.testing.assert_allclose(single, expected, rtol=0, atol=100 * np.finfo(np.float32).eps * largest)
 
 
-@pytest.mark.parametrize("size", [2, 3, 4])
-def test_powers_of_a_long_jordan_block_are_matrix_powers_and_underflow_to_zero(size):
-    matrix = block_diag(1, 0.5, jordan(0.25, size))
-    means = np.diag(matrix)
-    basis = Eigenbasis(np.eye(len(matrix)), np.eye(len(matrix)), means, means, ((slice(2, 2 + size), matrix[2:, 2:]),))
-    levels = np.array([0, 1, 2, 3, 4, 7, 20])
-    rows = np.random.default_rng(4).standard_normal((2, len(levels), len(matrix)))
+def test_powers_of_a_long_jordan_block_are_matrix_powers_and_underflow_to_zero(np_rng):
+    matrix, levels = block_diag(1, 0.5, jordan(0.25, 4)), np.array([0, 1, 2, 3, 4, 7, 20])
+    basis = Eigenbasis(np.eye(6), np.eye(6), *[np.diag(matrix)] * 2, ((slice(2, 6), matrix[2:, 2:]),))
+    rows = np_rng.standard_normal((2, len(levels), 6))
     powers = times_powers(rows, levels, basis, 1.0)
     np.testing.assert_allclose(powers, times_matrix_powers(rows, levels, matrix), rtol=0, atol=POWER)
-    powers = times_powers(np.ones((1, 2, 2 + size), dtype=np.float32), np.array([200, 100_000]), basis, 1.0)
-    np.testing.assert_array_equal(powers[0, :, 0], 1)
-    np.testing.assert_array_equal(powers[0, :, 1:], 0)
+    powers = times_powers(np.ones((1, 2, 6), dtype=np.float32), np.array([200, 100_000]), basis, 1.0)
+    np.testing.assert_array_equal(powers[0], [np.eye(6)[0]] * 2)
 
 
 DOES_NOT_CONTRACT = "the second eigenvalue has modulus 1.*; expected below 1, or there is no"

@@ -4,12 +4,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from evaluation.common import assert_exact, evaluate_from
+from evaluation.common import assert_exact
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
-from patches.closed_cages import cube_with_valence_2, polygons
+from patches.closed_cages import cube_with_valence_2
 from reference.bars import NORMAL, POINT
-from reference.brute_force import BruteForce
-from reference.exact_samples import SCHEMES, angle, bumpy, samples_at
+from reference.exact_samples import SCHEMES, angle, samples_at
 
 DEEP = (60, 75, 90)
 
@@ -37,18 +36,6 @@ def test_valence_2_matches_explicit_refinement_and_its_normal_is_that_of_the_sub
     at_point = surface.evaluate([0, 1], [[0.0, 0.0]])
     for normals in (at_point.n, np.cross(at_point.dp_du, at_point.dp_dv)):
         assert angle(normals, np.cross(a - c, b - d)).max() <= NORMAL
-
-
-def test_valence_2_has_one_limit_from_both_sides():
-    cage = bumpy(cube_with_valence_2(), 1)
-    around = np.flatnonzero(cage.face_vertices == 8)
-    assert len(around) == 2
-    samples = evaluate_from(LimitSurface(cage), around, [[0.0, 0.0]])
-    assert angle(*samples.n) <= NORMAL
-    face = int(cage.topology.face[around[0]])
-    corner = int(around[0] - cage.topology.face_offsets[face])
-    near = BruteForce("catmull_clark", cage.positions, polygons(cage.topology)).evaluate(face, corner, 2.0**-60, 0)
-    assert np.abs(samples.p - near.p.astype(float)).max() <= POINT
 
 
 def test_loop_at_valence_2_is_what_refinement_comes_to():

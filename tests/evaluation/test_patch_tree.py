@@ -86,8 +86,6 @@ def test_equal_parts_of_a_crease_are_refined_once(monkeypatch):
 
 
 class NeverIsolates(CatmullClark):
-    """A scheme whose every vertex and face is extraordinary."""
-
     regular_valence = 5
 
 
@@ -103,8 +101,6 @@ def test_weights_that_do_not_sum_to_one_are_an_error():
 
 
 class Skewed(CatmullClark):
-    """States children in other places than they are."""
-
     def children(self, topology, refined, half_edge):
         parts = super().children(topology, refined, half_edge)
         return [(ParameterMap(domain.matrix, domain.offset + 0.25), child) for domain, child in parts]

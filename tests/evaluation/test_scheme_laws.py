@@ -1,5 +1,3 @@
-"""Laws of schemes, and schemes of users: a worked example, and what is refused."""
-
 import numpy as np
 import pytest
 from evaluation.common import ChangedCatmullClark
@@ -64,7 +62,6 @@ class Bilinear(Scheme):
 
 @pytest.fixture
 def known(monkeypatch):
-    """Forget registered schemes after the test."""
     from mitsuba_subdivision.schemes import scheme
 
     monkeypatch.setattr(scheme, "_SCHEMES", dict(scheme._SCHEMES))

@@ -1,50 +1,17 @@
-"""Semi-sharp creases and corners, the smooth triangle rule, holes, and the boundary rule `none`."""
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from evaluation.common import evaluate_from
 from mitsuba_subdivision import LimitSurface, SchemeError
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.evaluation.element import element_stencils
 from mitsuba_subdivision.mesh.connectivity import Topology
 from mitsuba_subdivision.schemes import CatmullClark
-from patches.closed_cages import bipyramid, bumpy
-from peers.fidelity_cages import TOP
-from reference.refined_cages import channel_of, sheet, tagged
-from reference.refinement import refined
+from patches.closed_cages import bumpy
+from reference.refined_cages import sheet, tagged
 
 # Of cages of size about 2, in float64.
 POSITION = 1e-14
-BALLS = {"catmull_clark": cube(), "loop": bipyramid(4)}
-
-
-def sharp_ball(scheme, sharpness, spread, method, **options):
-    """Creases along all edges, of sharpness from ``sharpness`` down to nearly ``spread`` less."""
-    cage = BALLS[scheme]
-    fall = spread * np.arange(len(cage.edges)) / len(cage.edges)
-    creases = np.column_stack([cage.edges, sharpness - fall])
-    return tagged(cage, creases=creases, crease_method=method, **options)
-
-
-def test_sharpness_10_is_infinite_and_9_nearly():
-    cages = (bumpy(tagged(cube(), creases=[(*edge, s) for edge in TOP])) for s in (10, 9, 0))
-    infinite, nearly, smooth = (LimitSurface(cage).tessellate(4).positions for cage in cages)
-    assert np.abs(smooth.max(axis=0) - infinite.max(axis=0)).max() > 0.05
-    # The crease of 9 follows the other to half a thousandth of an edge.
-    distance = np.linalg.norm(infinite[:, None] - nearly[None], axis=2).min(axis=1)
-    assert 0 < distance.max() < 2e-3
-
-
-@pytest.mark.parametrize("scheme", BALLS)
-def test_a_vertex_of_sharpness_10_stays_and_one_of_9_nearly(scheme):
-    for sharpness, stays in ((10, True), (9, False)):
-        surface = LimitSurface(tagged(BALLS[scheme], corners=[(0, sharpness)]), scheme)
-        at_vertex = evaluate_from(surface, surface.cage.topology.vertex_half_edge[:1], [[0.0, 0.0]])
-        moved = np.abs(at_vertex.p[0] - surface.cage.positions[0]).max()
-        # A cusp draws near its tip more slowly than by halves.
-        assert (moved <= POSITION) if stays else (1e-5 < moved < 2e-2)
 
 
 def test_rules_that_change_nothing_keep_the_scheme():
@@ -95,53 +62,6 @@ def test_boundary_none_leaves_the_faces_that_do_not_touch_it():
         LimitSurface(sheet(2, 2, boundary="none"))
 
 
-def around(mesh, vertex):
-    """What one refinement beside a vertex depends on, two rings of faces, and the vertex's number in it."""
-    near = {vertex}
-    for _ in range(2):
-        faces = [face for face in mesh.faces if near & {*face}]
-        near = {v for face in faces for v in face}
-    number = {v: k for k, v in enumerate(sorted(near))}
-    values = {v: value for (v, _), value in mesh.values.items()}
-    kept = replace(
-        mesh,
-        faces=[tuple(number[v] for v in face) for face in faces],
-        indices=[(0,) * len(face) for face in faces],
-        values={(k, 0): values[v] for v, k in number.items()},
-        creases={frozenset(number[v] for v in edge): s for edge, s in mesh.creases.items() if edge <= near},
-        corners={number[v]: s for v, s in mesh.corners.items() if v in near},
-    )
-    return kept, number[vertex]
-
-
-# Refinements, after which a vertex is nearer to its limit than this: ten with a crease, then each divides the distance,
-# a thousandth of an edge at first, by about four.
-LASTING, CLOSE = 22, 1e-9
-
-
-@pytest.mark.parametrize("method", ["uniform", "chaikin"])
-@pytest.mark.parametrize("scheme", BALLS)
-def test_lasting_features_have_the_limits_of_brute_force(scheme, method, np_rng):
-    cage = bumpy(sharp_ball(scheme, 9.9, 0.9, method, corners=[(0, 9.6), (2, 4.3)]))
-    surface, points = LimitSurface(cage, scheme), channel_of(cage, cage.positions, cage.face_vertices)
-    size = int(cage.face_sizes[0])
-    element = int(np_rng.integers(0, cage.face_count))
-    descents = np_rng.integers(0, size, (2, 3)).tolist()
-    # The face at corner 0 of the one at corner 0 keeps a vertex of the cage.
-    for corners in [[0, 0, 0], *descents]:
-        face, mesh, uv = element, points, np.zeros((1, 2))
-        for corner in corners:
-            face, (mesh, _) = face * size + corner, refined(mesh, scheme)
-        for corner in corners[::-1]:
-            uv = surface.scheme.domain.rotation(corner)(uv / 2)
-        vertex = mesh.faces[face][0]
-        for _ in range(LASTING):
-            mesh, vertex = around(mesh, vertex)
-            mesh, _ = refined(mesh, scheme)
-        (limit,) = (value for (v, _), value in mesh.values.items() if v == vertex)
-        assert np.abs(surface.evaluate(element, uv).p[0] - limit).max() <= CLOSE
-
-
 class RolledFaces(CatmullClark):
     """Begins with the last refined face."""
 
@@ -160,7 +80,8 @@ class RolledFaces(CatmullClark):
 
 
 def test_the_order_in_which_a_scheme_numbers_faces_does_not_matter(np_rng):
-    cage = bumpy(sharp_ball("catmull_clark", 4.9, 0.9, "chaikin"))
+    creases = np.column_stack([cube().edges, np.linspace(4, 4.9, 12)])
+    cage = bumpy(tagged(cube(), creases=creases, crease_method="chaikin"))
     scheme = RolledFaces()
     scheme.crease_method = "chaikin"
     signature = LimitSurface(cage).patches.classes[0].signature

@@ -1,5 +1,3 @@
-"""What `LimitSurface` accepts and refuses."""
-
 import numpy as np
 import pytest
 from kernels.surfaces import SURFACES, surface_named
@@ -24,16 +22,6 @@ def test_no_samples_give_empty_arrays():
     samples = LimitSurface(cube()).evaluate(np.zeros(0, dtype=int), np.zeros((0, 2)))
     assert samples.p.shape == samples.n.shape == samples.dp_du.shape == (0, 3)
     assert samples.level.shape == (0,)
-
-
-def test_corners_name_the_same_point():
-    surface = LimitSurface(extraordinary(5))
-    u, v = 0.3, 0.2
-    same = surface.evaluate(7, [(u, v), (v, 1 - u), (1 - u, 1 - v), (1 - v, u)], corner=[0, 1, 2, 3])
-    # At corner 1 the u axis runs along the old v axis, and so on.
-    assert np.ptp(same.p, axis=0).max() < 1e-14
-    assert np.abs(same.dp_du[0] + same.dp_dv[1]).max() < 1e-13
-    assert np.abs(same.dp_dv[0] - same.dp_du[1]).max() < 1e-13
 
 
 NO_POINTS = ([1.0, 2.0, 3.0], [[1.0, 2.0]], [[0.0, np.nan, 0.0]], [[np.inf, 0.0, 0.0]])

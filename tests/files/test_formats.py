@@ -1,5 +1,3 @@
-"""All file formats: what is saved is read back, by other programs as well, and what cannot be is told."""
-
 import gzip
 import subprocess
 import sys

@@ -1,5 +1,3 @@
-"""PLY control cages, read and written."""
-
 import os
 import re
 import tempfile

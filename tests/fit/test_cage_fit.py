@@ -1,5 +1,3 @@
-"""Fits to pictures: what they find, what stays, and what they ask of users."""
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -32,7 +30,6 @@ PLACES = [(0, -5, 2), (5, 0, -1)]
 
 
 def views_of(cage, **shape):
-    """Pictures of a cage, with little noise."""
     shape = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": 4, **shape}
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, **SKY, **LIGHT, "shape": shape})
     sensors = [sensor(place) for place in PLACES]
@@ -102,7 +99,6 @@ def test_any_differentiable_integrator_will_do(views, integrator):
 
 
 def test_refining_keeps_the_surface(views, monkeypatch):
-    """After a step that moves it; the one with the refinement hardly does."""
     fit = made(cube(), views[:1], smoothing=0, learning_rate=[(0, 0.01), (1, 1e-9)], refine=[2]).run(2)
     refined = fit.cage.refined()
     fit.step()
@@ -117,7 +113,6 @@ def test_refining_keeps_the_surface(views, monkeypatch):
 
 
 def test_other_parameters_are_found():
-    """A colour, while the shape is held by its anchor."""
     name = "surface.bsdf.reflectance.value"
     views = views_of(cube(), bsdf={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.2, 0.5, 0.7]}})
     shape = {"bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}}
@@ -128,7 +123,6 @@ def test_other_parameters_are_found():
 
 
 def test_colours_at_the_cage_are_found_and_refined():
-    """They become part of the cage, and go on when it is refined."""
     colours = np.random.default_rng(4).random((8, 3))
     plain, target = (tagged(cube(), attributes={"colour": values}) for values in (np.full((8, 3), 0.5), colours))
     shown = {"bsdf": {"type": "diffuse", "reflectance": {"type": "mesh_attribute", "name": "vertex_colour"}}}
@@ -189,7 +183,6 @@ def test_unknown_sharpness_is_refined_with_the_cage(views, tmp_path):
 
 
 def test_masked_pixels_do_not_count(views):
-    """A picture that is wrong on its left half, where nobody looks."""
     mask = np.zeros((SIZE, SIZE))
     mask[:, SIZE // 2 :] = 1
     losses = []

@@ -1,5 +1,3 @@
-"""Fits to points and to meshes, and numbers that change from step to step."""
-
 import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface
@@ -25,7 +23,6 @@ def moved(cage):
 
 
 def distance(surface, other):
-    """Largest distance of points of one surface from the other, in sizes of it."""
     size = np.linalg.norm(np.ptp(other.cage.positions, axis=0))
     return other.closest_point(surface.sample(500, 9).p).distance.max() / size
 
@@ -70,7 +67,6 @@ def test_an_interrupted_run_leaves_its_last_complete_step(target, tmp_path, monk
 
 
 def test_a_refined_cage_comes_nearer():
-    """Of points of another surface, which the coarse cage cannot have."""
     directions = LimitSurface(cube()).sample(400, 2).p
     points = directions * (1 + 0.3 * np.sin(5 * directions[:, :1]))
     fit = PointFit(cube(), points, refine=[3, 6]).run(8)
@@ -80,7 +76,6 @@ def test_a_refined_cage_comes_nearer():
 
 
 def test_control_points_that_nothing_holds_stay(target):
-    """Of all points, only those of one element are given."""
     start = moved(target.cage)
     points = target.sample(4000, 1)
     few = points.p[points.element == 0]
@@ -115,7 +110,6 @@ def test_a_mesh_becomes_a_cage(target):
 
 
 def test_a_checkpoint_resumes_its_fit_and_no_other(target, tmp_path):
-    """The same steps follow, whether or not the fit was interrupted."""
     points = target.sample(300, 1).p
     whole, begun, again = (PointFit(moved(target.cage), points, refine=[2]) for _ in range(3))
     whole.run(5)

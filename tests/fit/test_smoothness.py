@@ -1,5 +1,3 @@
-"""Coordinates in which steps are large, and regularizers: against dense matrices, angles and differences."""
-
 import os
 
 import drjit as dr

@@ -1,5 +1,3 @@
-"""Creases of unknown sharpness: refined control points and their derivatives, against cages with these tags."""
-
 import numpy as np
 import pytest
 from mitsuba_subdivision import CageError, LimitSurface

@@ -102,10 +102,7 @@ def run(
         # Here, as a process that is ended leaves its files behind.
         tempfile.TemporaryDirectory(prefix="fuzz-") as place,
         ProcessPool(
-            processes,
-            initializer=_prepare,
-            initargs=(reader, seed),
-            context=multiprocessing.get_context("spawn"),
+            processes, initializer=_prepare, initargs=(reader, seed), context=multiprocessing.get_context("spawn")
         ) as pool,
     ):
         indices = range(first, first + count)

@@ -1,5 +1,3 @@
-"""Damage to files: of bytes, of numbers and words, of lines."""
-
 import re
 import struct
 from collections.abc import Callable

@@ -43,37 +43,6 @@ def test_valid_files_and_some_damaged_ones_are_cages(reader, tmp_path):
     assert 0.05 < sum(is_cage(number, *file) for number, file in enumerate(damaged)) / len(damaged) < 0.95
 
 
-def _leave_open(path):
-    kept.append(path.open("rb"))
-
-
-kept = []
-
-
-@pytest.mark.parametrize(
-    ("read", "finding"),
-    [
-        (lambda path: path[1], "TypeError at test_readers.py:"),
-        (lambda _: ControlCage([], []), "error without the file's name: control cage: positions"),
-        (lambda path: (_ for _ in ()).throw(CageError(f"{path}: " + 500 * "a")), "error of 502 characters: "),
-        (lambda _: warnings.warn("odd", RuntimeWarning, stacklevel=1), "RuntimeWarning: odd"),
-        (lambda _: warnings.warn("odd", CageWarning, stacklevel=1), "warning without the file's name: odd"),
-        (lambda path: path.open("rb").read() and None, "ResourceWarning: unclosed file"),
-        (_leave_open, "open file left: "),
-        (lambda path: path.read_bytes(), None),
-    ],
-)
-def test_what_breaks_the_law_is_found(tmp_path, monkeypatch, read, finding):
-    path = tmp_path / "a.obj"
-    path.write_bytes(b"v")
-    monkeypatch.setattr(ControlCage, "from_file", lambda path, **_: read(path))
-    problem = campaign.broken_law(path)
-    while kept:
-        kept.pop().close()
-    assert (problem or "").startswith(finding or "")
-    assert (problem is None) == (finding is None)
-
-
 def test_hangs_and_crashes_are_found_and_the_rest_is_read(tmp_path, monkeypatch):
     monkeypatch.setattr(campaign, "PATIENCE_ON_CLOCK", 20.0)
     problems = run("obj", 0, 6, 0, 1, tmp_path, _hang_and_crash)
@@ -87,8 +56,3 @@ def _hang_and_crash(_folder, _reader, _seed, index):
     if index == 2:
         os._exit(3)
     return "odd" if index == 4 else None
-
-
-def test_files_that_take_long_are_found(tmp_path, monkeypatch):
-    monkeypatch.setattr(campaign, "PATIENCE", -1.0)
-    assert campaign.read_one(str(tmp_path), "obj", 0, 0) == "0 s of computing"

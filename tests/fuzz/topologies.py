@@ -74,7 +74,6 @@ def is_manifold(faces):
 
 
 def numbered(faces):
-    """The same faces with vertices from 0 on."""
     number = {vertex: i for i, vertex in enumerate(vertices_of(faces))}
     return [tuple(number[v] for v in face) for face in faces]
 
@@ -161,7 +160,6 @@ def random_tags(faces, rng):
 
 
 def random_cage(rng):
-    """A cage and the name of its scheme."""
     scheme = SCHEMES[rng.integers(len(SCHEMES))]
     faces, origin = random_topology(rng)
     if scheme == "loop":

@@ -25,7 +25,6 @@ class Estimate:
 
     @property
     def error(self):
-        """Standard error of the mean."""
         return self.values.std(ddof=1) / np.sqrt(len(self.values))
 
     def __sub__(self, other):
@@ -51,7 +50,6 @@ class Pictures:
         return dr.mean(mi.render(self.scene, self.parameters, spp=self.spp, seed=seed), axis=None)
 
     def differences(self, h):
-        """Central differences with the same random numbers."""
         ends = [[self.mean(mi.Float(side * h), seed).array[0] for side in (1, -1)] for seed in self.seeds]
         return Estimate(np.array([(a - b) / (2 * h) for a, b in ends]))
 

@@ -28,7 +28,6 @@ def bumpy_cube(**tags):
 
 
 def dome():
-    """The bumpy cube without its top."""
     cage = bumpy_cube()
     faces = cage.face_vertices.reshape(-1, 4)
     kept, faces = np.unique(faces[cage.positions[faces, 2].mean(axis=1) < 0.7], return_inverse=True)
@@ -36,7 +35,6 @@ def dome():
 
 
 def inside_out():
-    """The bumpy cube with all faces turned."""
     cage = bumpy_cube()
     return ControlCage(cage.positions, cage.face_vertices.reshape(-1, 4)[:, ::-1])
 
@@ -73,7 +71,6 @@ LIT = {
 
 
 def lit(name, light, bsdf, rate, integrator, sizes, parameters):
-    """A scene of an exactly shaded surface, and the positions of its cage."""
     cage = LIT_CAGES[name]()
     if bsdf is COLOURED:
         colours = np.random.default_rng(0).random((cage.vertex_count, 3))
@@ -95,9 +92,8 @@ def outline(shape, *, emits=False, resolution=32):
     seen = {"integrator": {"type": "direct_projective", "sppi": 0, "sppc": 0}}
     seen["sensor"] = perspective(resolution, EYE, TARGET, UP, fov=FOV)
     light = {"emitter": {"type": "area", "radiance": 1.0}} if emits else {}
-    return scene_with(
-        **seen, **({} if emits else {"sky": {"type": "constant"}}), shape={**shape, "bsdf": BLACK, **light}
-    )
+    seen |= {} if emits else {"sky": {"type": "constant"}}
+    return scene_with(**seen, shape={**shape, "bsdf": BLACK, **light})
 
 
 def outline_of(surface, rate=RATE, *, emits=False, **more):

@@ -45,7 +45,6 @@ def materials():
 
 
 def inside(material, light, shape):
-    """A view of the middle of a shape."""
     # Of directions that the diffuse material chooses, the variance is far larger: they turn with the tangents.
     samples = {} if material == "rough" else {"bsdf_samples": 0}
     sensor = perspective(RESOLUTION, [1, -4, 2], fov=14)

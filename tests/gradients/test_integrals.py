@@ -1,5 +1,3 @@
-"""Derivatives of area, volume and moments: closed forms, and triangles that converge to the limit surface."""
-
 import sys
 
 import numpy as np

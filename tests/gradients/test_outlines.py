@@ -1,11 +1,9 @@
-"""Gradients of outlines are those of the area that triangles cover, which scan lines measure without a renderer."""
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 from gradients.estimates import ERRORS, MEANS_SOMETHING, Pictures, sum_along
-from gradients.outlines import EYE, LIT, LIT_CAGES, RATE, SURFACES, change, covered, lit, outline, outline_of
+from gradients.outlines import EYE, LIT, LIT_CAGES, RATE, SURFACES, change, lit, outline, outline_of
 from gradients.scenes import POINTS
 from gradients.surfaces import motions
 from mitsuba_subdivision.device_arrays import upload
@@ -137,15 +135,3 @@ def test_emitters_with_exact_shading_have_no_black_rims():
     np.testing.assert_array_equal(image, flat)
     # Rims are half a per cent of what shines.
     assert smooth.mean() < 0.997 * flat.mean()
-
-
-def test_scan_lines_measure_what_they_should():
-    """A square half hidden by another, and one of its size turned by 30 degrees."""
-    square = np.array([[-1, 0, -1], [1, 0, -1], [1, 0, 1], [-1, 0, 1]]) * 0.5
-    quads = np.array([[0, 1, 2], [0, 2, 3]])
-    view = (0, -1, 0), (0, 0, 0), (0, 0, 1), 90
-    turn = np.array([[np.sqrt(0.75), 0, -0.5], [0, 1, 0], [0.5, 0, np.sqrt(0.75)]])
-    pair = np.concatenate([square, square + np.array([0.25, 0, 0])])
-    assert covered(square, quads, *view) == pytest.approx(1 / 4, abs=1e-12)
-    assert covered(square @ turn, quads, *view) == pytest.approx(1 / 4, abs=1e-7)
-    assert covered(pair, np.concatenate([quads, quads + 4]), *view) == pytest.approx(1.25 / 4, abs=1e-12)

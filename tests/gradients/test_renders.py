@@ -1,5 +1,3 @@
-"""Gradients of pictures inside an outline: forward, reverse and differences agree within their standard errors."""
-
 import numpy as np
 import pytest
 from gradients.estimates import ERRORS, MEANS_SOMETHING, Pictures

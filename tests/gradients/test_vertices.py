@@ -1,5 +1,3 @@
-"""Derivatives of a tessellation in double precision: forward, reverse, and differences of another evaluation agree."""
-
 import sys
 
 import numpy as np
@@ -38,7 +36,6 @@ def on_host(table, positions, matrix):
 
 
 def extrapolated(function):
-    """Derivative at zero."""
 
     def central(step):
         return [(a - b) / (2 * step) for a, b in zip(function(step), function(-step), strict=True)]
@@ -68,11 +65,3 @@ def test_forward_reverse_and_differences_agree(name, tessellation, mirror, np_rn
     derivatives = derivatives_both_ways(vertices, inputs, changes, np_rng, ROUNDING)
     for derivative, difference in zip(derivatives, expected, strict=True):
         assert np.abs(derivative.reshape(-1, 3) - difference).max() <= DIFFERENCES * np.abs(difference).max()
-
-
-def test_adaptive_rates_differ():
-    """Else the tests above would prove nothing about strips between unlike rates."""
-    surface = ALL["catmull_clark"]()
-    uniform, chosen = (table_of(surface, kind) for kind in ("uniform", "adaptive"))
-    counts = np.bincount(chosen.element) / np.bincount(uniform.element)
-    assert counts.max() > 1.5 * counts.min()

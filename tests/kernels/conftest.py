@@ -1,5 +1,3 @@
-"""Fixtures for kernels."""
-
 import sys
 
 import drjit as dr
@@ -12,7 +10,6 @@ SINGLE, DOUBLE = 2e-6, 1e-13
 
 @pytest.fixture
 def llvm():
-    """Skip where no LLVM runs kernels."""
     problem = llvm_problem()
     if problem:
         pytest.skip(problem)
@@ -20,7 +17,6 @@ def llvm():
 
 @pytest.fixture(params=["Float", "Float64"])
 def float_type(request, llvm):  # noqa: ARG001
-    """Flat arrays of either precision."""
     return getattr(sys.modules["drjit.llvm.ad"], request.param)
 
 

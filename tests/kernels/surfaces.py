@@ -86,7 +86,6 @@ def surface_named(name):
 
 @lru_cache
 def kernel_named(name, variant):
-    """Its kernel, for tests that leave the control points as they are."""
     return surface_named(name).on_device(variant)
 
 
@@ -119,12 +118,10 @@ def on_device(types, element, uv, corner):
 
 
 def vectors(array):
-    """``(s, 3)`` numbers of 3-vectors."""
     return np.array(dr.detach(array)).T.astype(np.float64)
 
 
 def computed(results):
-    """Samples or hits, computed by one kernel."""
     dr.eval(results)
     return results
 

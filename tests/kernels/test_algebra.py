@@ -1,5 +1,3 @@
-"""Unit vectors have a length of one, and rows of numbers are read as they lie in memory."""
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

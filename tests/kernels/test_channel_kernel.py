@@ -1,5 +1,3 @@
-"""Attributes and texture coordinates on a device are those that channels evaluate with NumPy."""
-
 from functools import lru_cache
 
 import drjit as dr

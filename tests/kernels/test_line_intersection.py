@@ -1,5 +1,3 @@
-"""Hits of lines: on them and on the surface, from nearby and far away, at borders and next to extraordinary points."""
-
 import numpy as np
 import pytest
 from kernels.surfaces import aimed, computed, hit, kernel_named, random_locations, surface_named, vectors
@@ -143,9 +141,8 @@ def test_locations_are_where_the_points_lie_however_few_rounds_there_are(monkeyp
     monkeypatch.setattr(line_intersection, "ROUNDS", rounds)
     samples = surface.sample(12, 2)
     u, v = np.clip(samples.uv + np_rng.uniform(-0.1, 0.1, (12, 2)), 0.01, 0.49).T
-    start = kernel.walk.at(
-        types.indices(samples.element), types.floats(u), types.floats(v), types.indices(samples.corner)
-    )
+    place = types.indices(samples.element), types.floats(u), types.floats(v), types.indices(samples.corner)
+    start = kernel.walk.at(*place)
     lines = upload(types.vector3, samples.p), upload(types.vector3, samples.n)
     location, kind, values = computed(kernel.line_hits(*lines, start))
     are_hit = np.array(kind) == ON_LINE

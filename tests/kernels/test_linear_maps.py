@@ -1,5 +1,3 @@
-"""Values of a cage on a device: sparse weights times them, with derivatives, and what kernels look up."""
-
 import drjit as dr
 import numpy as np
 import pytest
@@ -14,7 +12,6 @@ ROWS, COLUMNS = 40, 12
 
 @pytest.fixture
 def weights(np_rng):
-    """Rows of a few weights that sum to one."""
     dense = np_rng.random((ROWS, COLUMNS)) * (np_rng.random((ROWS, COLUMNS)) < 0.3)
     dense[:, 0] += 0.1
     return sparse.csr_array(dense / dense.sum(axis=1, keepdims=True))

@@ -1,5 +1,3 @@
-"""Locations: carried over edges to the same points, and on triangles of tessellations."""
-
 import drjit as dr
 import numpy as np
 import pytest
@@ -72,10 +70,8 @@ def test_both_sides_of_an_edge_are_the_same_points_and_lead_back_or_to_the_borde
         # So little beyond that the point is the same but for rounding.
         reached, uv = carried(kernel, locations(kernel.types, half_edge, beside(domain, side, along, -1e-15)))
         left = (reached != half_edge) | (np.abs(uv - on_edge).max(axis=1) > BEYOND)
-        here, there = (
-            vectors(kernel.at(locations(kernel.types, h, np.clip(x, 0, 1))).p)
-            for h, x in ((half_edge, on_edge), (reached, uv))
-        )
+        both = (half_edge, on_edge), (reached, uv)
+        here, there = (vectors(kernel.at(locations(kernel.types, h, np.clip(x, 0, 1))).p) for h, x in both)
         np.testing.assert_allclose(here, there, rtol=0, atol=POINT)
         assert not left[~has_neighbour].any()
         seen += np.count_nonzero(left)

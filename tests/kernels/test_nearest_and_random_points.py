@@ -1,5 +1,3 @@
-"""Nearest and random points on a device: those that NumPy finds."""
-
 import drjit as dr
 import numpy as np
 import pytest

@@ -19,7 +19,6 @@ def signature_at(topology, half_edge, kind):
 
 
 def half_edges_of(topology, most=80):
-    """Some of them, all over the mesh."""
     count = topology.half_edge_count
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int)).tolist()
 
@@ -33,7 +32,6 @@ EVERY_KIND = pytest.mark.parametrize("kind", ["face", "vertex"])
 
 
 def gathered(ring, topology, half_edges):
-    """All at once, as some of them are."""
     table = RingTable(topology, [ring], np.array(half_edges), np.array([len(half_edges)]))
     index = np.arange(len(half_edges))
     (some,) = table.vertices_of(0 * index, index)
@@ -91,7 +89,6 @@ def test_gathered_ring_is_a_map_of_meshes(topology, kind):
 @by_name(WITH_SHEETS)
 @EVERY_KIND
 def test_many_elements_gather_as_each_alone(topology, kind, monkeypatch):
-    """Some of them at a time."""
     monkeypatch.setattr(ragged, "CHUNK_LENGTH", 3)
     classes = {}
     for half_edge in range(topology.half_edge_count):
@@ -110,19 +107,6 @@ def test_corners_of_sharpness_ten_are_not_semi_sharp(sharpness):
     at_corner, at_crease = (signature_at(cage.cut_mesh.topology, 4 * face, "face") for face in (0, 13))
     assert at_crease.is_semi_sharp
     assert at_corner.is_semi_sharp == (sharpness < 10)
-
-
-def test_faces_that_meet_at_a_vertex_of_valence_2_are_joined_along_both_edges():
-    topology = cube_with_valence_2().topology
-    ring = one_ring(signature_at(topology, 0, "face"))
-    controls = gathered(ring, topology, [0])[0]
-    assert ring.topology.face_vertices[3] == 3
-    assert controls[3] == 8
-    assert ring.topology.vertex_face_count[3] == 2
-    assert not ring.topology.is_border_vertex[3]
-    # Faces 0 and 1, and the four sides; the bottom is too far away.
-    assert ring.topology.face_count == 6
-    assert len(set(controls)) == ring.vertex_count - 1
 
 
 def test_face_across_one_edge_is_one_face_whichever_way_it_is_reached():

@@ -1,5 +1,3 @@
-"""Values that threads share: made once for a key, and those of other keys meanwhile."""
-
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier
 

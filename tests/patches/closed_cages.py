@@ -25,7 +25,6 @@ def torus(columns, rows, major_radius=2.0, minor_radius=1.0):
 
 
 def tetrahedron():
-    """Regular tetrahedron on four corners of the cube."""
     positions = [[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]]
     faces = [[0, 1, 3], [0, 2, 1], [0, 3, 2], [1, 2, 3]]
     return ControlCage(positions, faces, source=CageSource("tetrahedron"))
@@ -140,7 +139,6 @@ CLOSED_CAGES = {
 
 
 def triangulated(cage):
-    """Cage whose polygons are cut into triangles at their first vertex."""
     faces = [(f[0], f[i], f[i + 1]) for f in polygons(cage.topology) for i in range(1, len(f) - 1)]
     return ControlCage(cage.positions, faces)
 
@@ -166,18 +164,15 @@ def cage_of(scheme, name):
 
 
 def bumpy(cage, seed=0, size=0.1):
-    """Cage without symmetry."""
     noise = np.random.default_rng(seed).uniform(-size, size, cage.positions.shape)
     return cage.with_positions(cage.positions + noise)
 
 
 def polygons(topology):
-    """Vertices of each face, as tuples."""
     return [tuple(map(int, face)) for face in np.split(topology.face_vertices, topology.face_offsets[1:-1])]
 
 
 def creased(cage, sharpness=10.0):
-    """The cage with creases along all edges."""
     t, first = cage.topology, cage.topology.edge_half_edge
     ends = t.face_vertices[first], t.face_vertices[t.next[first]]
     creases = np.column_stack([*ends, np.full(len(first), sharpness)])

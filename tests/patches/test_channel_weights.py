@@ -1,5 +1,3 @@
-"""Weights of attributes are what evaluation multiplies their values by."""
-
 import numpy as np
 import pytest
 from kernels.surfaces import grid_locations
@@ -84,8 +82,6 @@ def test_values_of_faces_cut_from_each_other_are_linear(name, mode, np_rng, monk
 
 def test_values_of_faces_cut_from_each_other_are_subdivided_where_that_is_not_linear(np_rng):
     """Without corners there, and around the middle of polygons."""
-    for cage in (
-        with_attributes(named_cages.cube(), np_rng, face_varying="none"),
-        with_attributes(mixed_torus(), np_rng),
-    ):
+    polygons = with_attributes(mixed_torus(), np_rng)
+    for cage in (with_attributes(named_cages.cube(), np_rng, face_varying="none"), polygons):
         assert not LimitSurface(cage).channel("islands").layout.is_linear

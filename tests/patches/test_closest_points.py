@@ -11,7 +11,7 @@ from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.patches import closest_points
 from mitsuba_subdivision.patches.closest_points import BoxTree
 from mitsuba_subdivision.patches.nearest_in_piece import TurnedBoxes, nearest_in_pieces
-from patches.closed_cages import bumpy, cage_of, creased
+from patches.closed_cages import bumpy, cage_of
 from reference.refined_cages import sheet
 from scipy.spatial import cKDTree
 
@@ -124,15 +124,6 @@ def test_points_above_places_at_and_next_to_extraordinary_ones(name, np_rng):
     assert (surface.closest_point(points).distance <= heights + ROUNDED).all()
 
 
-def test_creases_are_found(np_rng):
-    """A cube of creases is flat: the nearest points are those of a box."""
-    points = np_rng.uniform(1, 3, (50, 3)) * np_rng.choice([-1, 1], (50, 3))
-    points[:20, 0] = np_rng.uniform(-1, 1, 20)
-    points[:10, 1] = np_rng.uniform(-1, 1, 10)
-    nearest = LimitSurface(creased(cube())).closest_point(points)
-    np.testing.assert_allclose(nearest.p, np.clip(points, -1, 1), rtol=0, atol=1e-13)
-
-
 def points_of_pieces(pieces, which, uv):
     return np.einsum("sb,sbx->sx", pieces.basis.values(uv), pieces.coefficients[which]) + pieces.origins[which]
 
@@ -154,9 +145,7 @@ def test_distances_that_count_as_convex_are_no_more_than_means_in_the_middle(np_
 
 def test_bounds_around_extraordinary_points_move_with_them():
     cage = surface_named("mixed torus").cage
-    here, there = (
-        LimitSurface(cage.with_positions(cage.positions + away))._surface_pieces.tips for away in (0.0, 64.0)
-    )
+    here, there = (LimitSurface(cage.with_positions(cage.positions + away))._surface_pieces.tips for away in (0, 64))
     for one, other in zip(here, there, strict=True):
         np.testing.assert_allclose(one.reach(2), other.reach(2), rtol=1e-9)
 

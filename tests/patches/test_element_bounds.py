@@ -1,5 +1,3 @@
-"""Boxes of elements: they contain the surface in both precisions, and are little larger than they have to be."""
-
 import numpy as np
 import pytest
 from kernels.surfaces import KINDS, SURFACES, grid_locations, surface_named

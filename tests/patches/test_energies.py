@@ -1,5 +1,3 @@
-"""Stiffness and bending matrices have the null spaces, signs and variations of the energies that they stand for."""
-
 import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface

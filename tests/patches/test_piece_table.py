@@ -52,9 +52,8 @@ def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkey
     assert table.refinement.shape == (refined.table.topology.vertex_count, cage.vertex_count)
     np.testing.assert_allclose(table.refinement.sum(axis=1), 1, rtol=0, atol=ROUNDING)
     positions = surface.cage.positions
-    np.testing.assert_allclose(
-        table.refinement @ positions, refined.matrix @ positions[surface.cage.cut_mesh.vertex], rtol=0, atol=ROUNDING
-    )
+    expected = refined.matrix @ positions[surface.cage.cut_mesh.vertex]
+    np.testing.assert_allclose(table.refinement @ positions, expected, rtol=0, atol=ROUNDING)
     np.testing.assert_array_equal(table.controls, refined.table.controls)
     assert surface.sampling(1).refinement is table.refinement
     # The patch at a half-edge is the refined face there.
@@ -74,6 +73,5 @@ def test_parts_that_are_divided_alike_share_their_pieces():
 
 
 def test_a_table_without_creases_has_the_controls_of_the_patches_themselves():
-    """Nothing is copied."""
     surface = LimitSurface(extraordinary(5))
     assert np.shares_memory(surface.pieces().controls, surface.patches.controls)

@@ -1,9 +1,7 @@
-"""Areas: closed forms, fine triangles, and what scaling and refinement do to them."""
-
 import numpy as np
 import pytest
 from kernels.surfaces import surface_named
-from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
 from patches.closed_cages import bumpy, cage_of, creased
 from reference.refined_cages import sheet, tagged
@@ -34,25 +32,6 @@ def test_area_of_a_flat_sheet(triangles):
 @pytest.mark.core
 def test_area_of_a_box_of_creases():
     np.testing.assert_allclose(LimitSurface(creased(cube())).area(), 24, rtol=EXACT)
-
-
-@pytest.mark.core
-def test_area_of_a_cylinder_of_b_splines():
-    """A prism over a polygon is ruled: its area is the length of a closed B-spline curve times its height."""
-    n, height = 7, 3
-    angle = 2 * np.pi * np.arange(n) / n
-    ring = np.stack([np.cos(angle), 0.6 * np.sin(angle)], axis=1)
-    positions = np.concatenate([np.column_stack([ring, np.full(n, z)]) for z in range(height + 1)])
-    first = np.arange(n * height)
-    second = np.where(first % n == n - 1, first + 1 - n, first + 1)
-    faces = np.stack([first, second, second + n, first + n], axis=1)
-    nodes, weights = np.polynomial.legendre.leggauss(40)
-    t = ((nodes + 1) / 2)[:, None, None]
-    before, first, second, after = (np.roll(ring, shift, axis=0) for shift in (1, 0, -1, -2))
-    # Derivative of the uniform cubic B-spline.
-    speed = (-((1 - t) ** 2) * before + (3 * t**2 - 4 * t) * first + (1 + 2 * t - 3 * t**2) * second + t**2 * after) / 2
-    length = (np.linalg.norm(speed, axis=2) * weights[:, None] / 2).sum()
-    np.testing.assert_allclose(LimitSurface(ControlCage(positions, faces)).area(), height * length, rtol=EXACT)
 
 
 # Extrapolation does less for many triangles around a vertex, and where surfaces bend at several levels.

@@ -23,7 +23,6 @@ def made(positions, faces, **options):
 
 
 def circle(count):
-    """Points around the origin, counter-clockwise from (1, 0, 0)."""
     turn = 2 * np.pi * np.arange(count) / count
     return np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
 
@@ -66,7 +65,6 @@ def fan(valence, triangles=False, **options):
 
 
 def spoked(valence, sharpness, **options):
-    """A fan with creases along some of its spokes."""
     return fan(valence, creases=[(0, spoke, s) for spoke, s in sharpness.items()], **options)
 
 
@@ -89,7 +87,6 @@ def lathe_ring(ring):
 
 
 def rings(sharpness):
-    """Creases along some rings of a lathe."""
     return [(a, b, s) for ring, s in sharpness.items() for a, b in lathe_ring(ring)]
 
 

@@ -70,7 +70,6 @@ EVERY_ISLAND = pytest.mark.parametrize("cage", ISLANDS.values(), ids=ISLANDS)
 
 
 def at(cage, sampling, count):
-    """Samples that are not on holes."""
     element, uv, corner = sampling(cage, *count)
     there = ~cage.is_hole[element]
     return element[there], uv[there], corner[there]
@@ -191,25 +190,7 @@ def test_face_varying_values(cage):
     assert distance(ours, theirs.fvar)[known].max() <= FACE_VARYING_MASK
 
 
-@pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("cube", lambda cage: {"positions": cage.positions + 1e-9}),
-        ("sheet", lambda _: {"boundary": "edge_only"}),
-        ("piece", lambda _: {"creases": [(5, 6, 10)]}),
-    ],
-    ids=["a vertex moved", "another boundary rule", "another crease"],
-)
-def test_other_surfaces_are_told_apart(name, change):
-    cage = SURFACES[name]
-    element, uv, corner = lattice(cage, STEPS)
-    ours = LimitSurface(changed(cage, **change(cage))).evaluate(element, uv, corner)
-    theirs = evaluate(cage, element, uv, corner, method="refine", level=LEVEL)
-    assert distance(ours.p, theirs.p).max() > POINT * box(cage)
-
-
 def _apart(ours, theirs, element):
-    """The faces on which surfaces differ."""
     return set(element[distance(ours.p, theirs.p) > POINT].tolist())
 
 

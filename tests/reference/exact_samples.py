@@ -56,7 +56,6 @@ def subdominant(scheme: str, valence: int) -> float:
 
 
 def faces_of(cage: ControlCage) -> list[np.ndarray]:
-    """One vertex list per face."""
     return np.split(cage.face_vertices, cage.topology.face_offsets[1:-1])
 
 
@@ -135,6 +134,5 @@ def samples_at(scheme: str, valence: int, levels: tuple[int, ...] = LEVELS) -> E
     else:
         limit = reference.limit(0)
     p, dp_du, dp_dv, *second, n, curvature, _ = (np.array(values, dtype=float) for values in zip(*samples, strict=True))
-    return ExactSamples(
-        scheme, valence, cage, uv, p, dp_du, dp_dv, n, np.stack(second), curvature.T, *np.array(limit, dtype=float)
-    )
+    limit = np.array(limit, dtype=float)
+    return ExactSamples(scheme, valence, cage, uv, p, dp_du, dp_dv, n, np.stack(second), curvature.T, *limit)

@@ -15,7 +15,6 @@ from reference.refinement import Channel
 
 
 def sheet(columns, rows, *, triangles=False, **options):
-    """Flat sheet of squares, or of triangles."""
     positions = [[i, j, 0.0] for j in range(rows + 1) for i in range(columns + 1)]
     first = [j * (columns + 1) + i for j in range(rows) for i in range(columns)]
     quads = [[a, a + 1, a + columns + 2, a + columns + 1] for a in first]
@@ -24,7 +23,6 @@ def sheet(columns, rows, *, triangles=False, **options):
 
 
 def half_disc(faces):
-    """Triangles around vertex 0, which lies on their border."""
     turn = np.linspace(0, np.pi, faces + 1)
     ring = np.stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)], axis=1)
     return ControlCage([[0, 0, 0], *ring], [[0, 1 + i, 2 + i] for i in range(faces)])
@@ -76,9 +74,8 @@ def refined(surface):
     cut = surface.cage.cut_mesh
     refinement = surface.scheme.refine(cut.topology)
     t = refinement.topology
-    cage = ControlCage.from_arrays(
-        refinement.apply(surface.cage.positions[cut.vertex]), t.face_sizes, t.face_vertices, boundary="edge_only"
-    )
+    points = refinement.apply(surface.cage.positions[cut.vertex])
+    cage = ControlCage.from_arrays(points, t.face_sizes, t.face_vertices, boundary="edge_only")
     # Its own rules and edges: what a cage of these faces has not.
     structure = replace(cage.structure, topology=t)
     vars(structure)["cut"] = CutMesh(t, np.arange(t.vertex_count))

@@ -19,7 +19,6 @@ Face = tuple[Hashable, ...]
 
 @contextmanager
 def precision(digits: int):
-    """Decimal arithmetic with this many digits inside the block."""
     with localcontext() as context:
         context.prec = digits
         yield
@@ -45,7 +44,6 @@ def mean(points: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def rotate(items: Sequence, k: int) -> tuple:
-    """The same cycle, beginning with item ``k``."""
     k %= len(items)
     return tuple(items[k:]) + tuple(items[:k])
 

@@ -106,15 +106,3 @@ def test_samples_tend_to_the_limit_and_digits_are_enough(scheme, cage, at, eleme
     for a, b in zip(usual[:7], finer[:7], strict=True):
         # Relative to the size of each derivative.
         assert np.abs(a - b).max() < Decimal("1e-30") * np.abs(b).max()
-
-
-def test_refuses_what_it_cannot_evaluate():
-    points, faces = without_symmetry(trapezohedron(5))
-    for scheme, cage, uv, message in (
-        ("catmull_clark", (points, faces), (0, 0), "extraordinary"),
-        ("catmull_clark", (points, faces), (1.5, 0), "outside the domain"),
-        ("catmull_clark", (points, faces[1:]), (0.5, 0.5), "boundary"),
-        ("loop", without_symmetry(bipyramid(3)), (0.75, 0.5), "outside the domain"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            BruteForce(scheme, *cage).evaluate(0, 0, *uv)

@@ -28,12 +28,10 @@ def changed(valence, name, change):
 
 
 def brighter(valence):
-    """The albedo of the surface, one per cent higher."""
     return changed(valence, "bsdf.reflectance.value", lambda shape: 1.01 * shape["bsdf.reflectance.value"])
 
 
 def turned_normals(valence):
-    """The normals of one patch, turned by 0.1 degrees."""
 
     def turned(shape):
         normals = np.array(shape["vertex_normals"], dtype=np.float64).reshape(-1, 3)
@@ -46,7 +44,6 @@ def turned_normals(valence):
 
 
 def moved_vertex(valence):
-    """One vertex of the cage, moved by 1e-3 along z."""
 
     def moved(shape):
         points = np.array(shape["control_points"])
@@ -57,7 +54,6 @@ def moved_vertex(valence):
 
 
 def stam(valence):
-    """Stam's form in single precision instead of the stabilised one."""
     return scene_of(valence, evaluator="stam", sample_offset={3: "1e-6", 5: "1e-8"}[valence])
 
 
@@ -77,7 +73,6 @@ class OtherVertexRule(CatmullClark):
 
 
 def wrong_rule(valence):
-    """One weight of a refinement rule wrong by 1e-3."""
     register_scheme(OtherVertexRule())
     try:
         return scene_of(valence)

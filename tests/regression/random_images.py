@@ -1,5 +1,3 @@
-"""Images made of random numbers instead of renders."""
-
 import numpy as np
 from mitsuba_subdivision.regression.image import Estimate, Image, Probe, combine
 

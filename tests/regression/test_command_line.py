@@ -1,5 +1,3 @@
-"""The commands: what they print, write and return."""
-
 import json
 import re
 import sys

@@ -1,5 +1,3 @@
-"""OpenEXR files: what comes back, and what is refused."""
-
 import os
 from operator import attrgetter
 
@@ -20,13 +18,7 @@ def test_an_image_comes_back_as_it_was_and_gives_the_same_bytes_again(tmp_path, 
     before = random_image(np_rng)
     save_image(tmp_path / "a.exr", before)
     after = load_image(tmp_path / "a.exr")
-    names = [
-        "pixels",
-        "paired",
-        "estimate.variance",
-        "estimate.count",
-        *(f"probe.{name}" for name in vars(after.probe)),
-    ]
+    names = ["pixels", "paired", "estimate.variance", "estimate.count", *(f"probe.{n}" for n in vars(after.probe))]
     for values in map(attrgetter, names):
         assert np.array_equal(values(after), values(before))
     assert after.metadata == {"schema": 1, **before.metadata}
@@ -112,19 +104,15 @@ def test_pictures_are_compared_over_the_union_of_their_data_windows_within_the_d
     a, b = (load_image(tmp_path / f"{name}.exr") for name in ("moved", "overscan"))
     assert np.array_equal(a.pixels, whole)
     assert compare(a, b).exit_status == 0
-    with pytest.raises(
-        RegressionError, match=r"whole.exr. has 10 x 8 .* from x = 0, y = 0.*moved.exr. has 10 x 8 .* from x = 2, y = 2"
-    ):
+    message = r"whole.exr. has 10 x 8 .* from x = 0, y = 0.*moved.exr. has 10 x 8 .* from x = 2, y = 2"
+    with pytest.raises(RegressionError, match=message):
         compare(images["whole"], a)
 
 
 def test_layers_and_positions_of_other_programs_are_channels(tmp_path):
     """A position pass has some names of old references' probes, and alpha comes first."""
-    layers = {"P.X": 1, "P.Y": 2, "N": 3, "A": 4}
-    write_channels(
-        tmp_path / "a.exr",
-        {**dict.fromkeys("RGB", PIXELS[..., 0]), **{n: v * PIXELS[..., 0] for n, v in layers.items()}},
-    )
+    factors = {**dict.fromkeys("RGB", 1), "P.X": 1, "P.Y": 2, "N": 3, "A": 4}
+    write_channels(tmp_path / "a.exr", {name: factor * PIXELS[..., 0] for name, factor in factors.items()})
     image = load_image(tmp_path / "a.exr")
     assert image.names == ("R", "G", "B", "A", "N", "P.X", "P.Y")
     assert np.array_equal(image.pixels[..., 3:], PIXELS[..., :1] * [4, 3, 1, 2])

@@ -1,5 +1,3 @@
-"""The pytest plugin, in projects of its own."""
-
 import json
 import os
 from pathlib import Path
@@ -228,13 +226,8 @@ def test_wrong_files_are_told_in_one_line_before_anything_is_rendered(with_refer
     monkeypatch.chdir(with_reference.path / "elsewhere")
     with_reference.runpytest("..").assert_outcomes(passed=1)
     monkeypatch.setattr(renders, "render_pass", None)
-    told(
-        'folder "/proc/references" cannot be made*',
-        "--render-update-all",
-        "-o",
-        "render_references=/proc/references",
-        "..",
-    )
+    elsewhere = "-o", "render_references=/proc/references", ".."
+    told('folder "/proc/references" cannot be made*', "--render-update-all", *elsewhere)
     monkeypatch.setattr(fixture, "imported_too_late", lambda: True)
     with_reference.makepyfile(TEST.replace("scalar_rgb", "llvm_ad_rgb"))
     told('*add "import mitsuba_subdivision" above the first "import mitsuba"*', "..")

@@ -1,5 +1,3 @@
-"""Renders: scenes, images in parts and in passes, here and on a cluster; the same command gives the same image."""
-
 import os
 import subprocess
 import sys
@@ -60,7 +58,8 @@ def test_passes_from_files_in_any_order_make_the_image(tmp_path, loaded):
 def test_merging_by_steps_counts_all_batches_and_keeps_what_only_the_first_pass_has(loaded):
     passes = [render_pass(loaded, SAMPLING, i, 4, with_probe=True) for i in (1, 2, 3, 4)]
     assert [image.probe is not None for image in passes] == [True, False, False, False]
-    merged = merge_passes([*passes[:1:-1], merge_passes(passes[:2])])
+    # Ranges of batches interleave.
+    merged = merge_passes([passes[3], merge_passes(passes[::2]), passes[1]])
     assert merged.estimate.batches == 12
     assert merged.metadata["sampling"]["batches"] == [[0, 12]]
     assert np.array_equal(merged.paired, passes[0].paired)
@@ -283,9 +282,7 @@ def frame_after_a_death(frame, marker, command, number):
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
-def test_frames_passes_and_references_have_the_bits_of_one_machine_although_a_worker_dies(
-    tmp_path, monkeypatch, capsys
-):
+def test_a_cluster_gives_the_bits_of_one_machine_although_a_worker_dies(tmp_path, monkeypatch, capsys):
     distributed = pytest.importorskip("distributed")
     (tmp_path / "model.usda").write_text(MODEL)
     monkeypatch.chdir(tmp_path)

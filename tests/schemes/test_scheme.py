@@ -1,5 +1,3 @@
-"""Rules that schemes have of a cage, and what their refinements and bases have in common."""
-
 import numpy as np
 import pytest
 from mitsuba_subdivision.schemes import SchemeError, scheme_named

@@ -37,14 +37,7 @@ def down(x=0.1, y=0.2, z=5):
     return mi.Ray3f(mi.Point3f(x, y, z), mi.Vector3f(0, 0, -1))
 
 
-def all_directions(count=512):
-    """Along as many meridians of a ball as circles."""
-    z, a = np.meshgrid(np.linspace(-0.999, 0.999, count), np.linspace(0, 2 * np.pi, count))
-    return np.stack([np.sqrt(1 - z**2) * np.cos(a), np.sqrt(1 - z**2) * np.sin(a), z], axis=-1).reshape(-1, 3)
-
-
 def hit(shape, *place):
-    """Of a ray from above."""
     return scene_with(shape=shape).ray_intersect(down(*place))
 
 

@@ -1,5 +1,3 @@
-"""The shape with an adaptive tessellation: its parameters, its buffers, its pictures."""
-
 import mitsuba as mi
 import numpy as np
 import pytest

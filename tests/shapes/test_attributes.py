@@ -1,5 +1,3 @@
-"""Texture coordinates and attributes of the shape: parameters, buffers, derivatives and renders."""
-
 import gc
 
 import drjit as dr

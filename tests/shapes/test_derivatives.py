@@ -1,5 +1,3 @@
-"""Derivatives of vertices and of what rays meet, by every parameter, against differences."""
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -40,7 +38,6 @@ PLACED, VALUES = ("control_points", "to_world"), ("cage_texcoords", "cage_colour
 
 @pytest.fixture
 def named(request, monkeypatch):
-    """A cage and its scheme."""
     if request.param == "refined":
         refine_first(monkeypatch)
     return CAGES[request.param](), request.param if request.param in ("loop", "doo_sabin") else "catmull_clark"
@@ -119,10 +116,8 @@ def test_derivatives_of_what_rays_meet_are_differences(named, by, parameters, sh
     expected = difference(ahead[0], behind[0])
     np.testing.assert_allclose(forward[same], expected[same], rtol=0, atol=DIFFERENCE * largest)
     for name in tangents:
-        forward, expected = (
-            np.array(values).reshape(COUNT, -1)[same]
-            for values in (dr.grad(others[name]), difference(ahead[1][name], behind[1][name]))
-        )
+        both = dr.grad(others[name]), difference(ahead[1][name], behind[1][name])
+        forward, expected = (np.array(values).reshape(COUNT, -1)[same] for values in both)
         error, size = (np.abs(values).max(axis=1) for values in (forward - expected, expected))
         assert np.mean(error > TANGENTS * (size + (np.median(size) or 1))) <= MOST_OTHERS, name
 

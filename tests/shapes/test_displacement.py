@@ -1,5 +1,3 @@
-"""Displacement: heights, and vertices and hits against the formula in double precision, welded copies, errors."""
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -89,7 +87,6 @@ def bilinear(uv):
 
 
 def difference(function, corner, uv, axis, step):
-    """Of points or normals, by one of the parameters."""
     aside = step * np.eye(2)[axis]
     return (function(corner, uv + aside) - function(corner, uv - aside)) / (2 * step)
 
@@ -149,7 +146,6 @@ def test_vertices_lie_on_the_displaced_surface_with_its_normals(name, kind, to_w
 
 
 def typical(values, expected, part):
-    """How far values are off, but for so many."""
     return np.quantile(np.linalg.norm(values - expected, axis=1), part)
 
 
@@ -180,9 +176,8 @@ def test_hits_are_on_the_displaced_surface_with_its_normals_and_derivatives(plai
     # Some rays pass along outlines, of which each island's rim is one.
     assert on_line.mean() > 0.95
     corner, uv = corner[on_line], uv[on_line]
-    n, *slopes = (
-        np.array(vectors).T[inside][on_line] for vectors in (si.sh_frame.n, si.dp_du, si.dp_dv, si.dn_du, si.dn_dv)
-    )
+    met = si.sh_frame.n, si.dp_du, si.dp_dv, si.dn_du, si.dn_dv
+    n, *slopes = (np.array(vectors).T[inside][on_line] for vectors in met)
     assert typical(n, truth.normals(corner, uv), 0.99) < HIT_NORMAL
     for axis, (dp, dn) in enumerate(zip(slopes[:2], slopes[2:], strict=True)):
         assert typical(dp, difference(truth.points, corner, uv, axis, STEP), 0.99) < HIT_DERIVATIVE
@@ -233,10 +228,8 @@ def test_flipped_normals_move_the_surface_the_same_way_and_no_height_nothing():
     cage = CAGES["creased islands"]()
     flipped, plain = (make(CAGES["cube"](), "vertex_height", flip_normals=flip) for flip in (True, False))
     np.testing.assert_array_equal(vertices(flipped)[0], vertices(plain)[0])
-    (p, n), undisplaced = (
-        vertices(load(cage, tessellation_rate=RATE)),
-        vertices(make(cage, turned(), displacement_scale=0.0)),
-    )
+    p, n = vertices(load(cage, tessellation_rate=RATE))
+    undisplaced = vertices(make(cage, turned(), displacement_scale=0.0))
     np.testing.assert_array_equal(undisplaced[0], p)
     np.testing.assert_allclose(undisplaced[1], n, rtol=0, atol=SINGLE)
 

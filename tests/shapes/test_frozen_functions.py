@@ -1,5 +1,3 @@
-"""Updates and gradients of the shape inside and outside of functions that Dr.Jit freezes."""
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -26,9 +24,8 @@ def loaded(shading, **parameters):
     # One hit takes less time to compile than paths of light.
     integrator = {"type": "aov", "aovs": "normals:sh_normal,colours:albedo,texcoords:uv"}
     sensor = perspective({"type": "hdrfilm", "width": 8, "height": 8}, [4, -6, 4])
-    scene = scene_with(
-        integrator=integrator, sensor=sensor, shape=described(cage, shading=shading, bsdf=bsdf, **parameters)
-    )
+    shape = described(cage, shading=shading, bsdf=bsdf, **parameters)
+    scene = scene_with(integrator=integrator, sensor=sensor, shape=shape)
     return scene, mi.traverse(scene)
 
 
@@ -98,11 +95,8 @@ def test_gradients_of_frozen_pictures_and_of_whole_steps_are_those_of_others(sha
         picture(scene, parameters, seed)
         return [dr.grad(leaf) for leaf in leaves]
 
-    plain, frozen, function = (
-        loaded(shading, **given),
-        loaded(shading, **given),
-        dr.freeze(step if is_whole else picture),
-    )
+    plain, frozen = (loaded(shading, **given) for _ in range(2))
+    function = dr.freeze(step if is_whole else picture)
     for number in range(1, 4):
         seed = dr.opaque(mi.UInt32, number)
         expected, arguments = step(picture, *plain, values(by, number), seed), (*frozen, values(by, number), seed)

@@ -1,5 +1,3 @@
-"""Shapes that are made: any number loads, without the collector, and they share all but what follows positions."""
-
 import gc
 import os
 import threading

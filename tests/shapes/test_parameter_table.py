@@ -72,9 +72,8 @@ def test_a_stated_default_is_the_value_as_scene_files_have_it(row):
 
 
 # The numbers next to a bound, on either side: some parameters take the bound itself, and some do not.
-BELOW_ZERO, ABOVE_ZERO, BELOW_ONE, BELOW_180 = (
-    float(np.nextafter(*pair)) for pair in ((0, -1), (0, 1), (1, 0), (180, 0))
-)
+ENDS_OF_RANGES = (0, -1), (0, 1), (1, 0), (180, 0)
+BELOW_ZERO, ABOVE_ZERO, BELOW_ONE, BELOW_180 = (float(np.nextafter(*pair)) for pair in ENDS_OF_RANGES)
 # Numbers that are taken, and numbers that are refused.
 ENDS = {
     "sensor_fov": ((0.0, BELOW_180), (BELOW_ZERO, 180.0)),

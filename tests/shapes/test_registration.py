@@ -1,5 +1,3 @@
-"""The plugin is there in every variant, in any order of import and `set_variant`; exact shading, where it works."""
-
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -88,10 +86,8 @@ def test_equal_shapes_of_a_scene_stay_two_and_can_be_written_as_xml():
     scene = scene_with(m={"type": "diffuse", "id": "m"}, a=shape, b=shape, c={**shape, **aside})
     assert sorted(shape.id() for shape in scene.shapes()) == ["a", "b", "c"]
     # Whether or not objects of a scene are merged.
-    assert (
-        len(mi.load_dict({"type": "scene", "a": described(cube()), "b": described(cube())}, optimize=False).shapes())
-        == 2
-    )
+    equal = {"type": "scene", "a": described(cube()), "b": described(cube())}
+    assert len(mi.load_dict(equal, optimize=False).shapes()) == 2
     parameters = mi.traverse(scene)
     update(parameters, {"a.control_points": parameters["a.control_points"] * 2})
     a, c = (scene.ray_intersect(down(x, 0.1, 9)) for x in (0.1, 4.1))
@@ -103,7 +99,7 @@ def test_equal_shapes_of_a_scene_stay_two_and_can_be_written_as_xml():
     assert '<integer name="tessellation_rate" value="3"' in text
 
 
-def test_a_first_picture_imports_little():
+def test_a_first_picture_and_coarse_tessellations_import_little():
     # What Mitsuba itself has imported costs nothing more. These take longest of the rest.
     printed(f"""
 import sys, mitsuba as mi, numpy
@@ -113,6 +109,10 @@ assert "mitsuba.scalar_rgb" not in sys.modules
 mi.set_variant("scalar_rgb")
 scene = {{"type": "scene", "cage": {{"type": "subdivision", "filename": {str(STAR)!r}}}}}
 mi.render(mi.load_dict(scene | {{"sensor": {{"type": "perspective"}}, "integrator": {{"type": "direct"}}}}), spp=1)
+from mitsuba_subdivision import ControlCage, LimitSurface
+tetrahedron = [(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], [(0, 1, 2), (0, 3, 1), (0, 2, 3), (1, 3, 2)]
+for scheme in ("catmull_clark", "loop", "doo_sabin"):
+    LimitSurface(ControlCage(*tetrahedron), scheme).tessellate(4)
 heavy = {{"scipy", "pathlib", "argparse"}}
 assert not heavy & (set(sys.modules) - there), heavy & (set(sys.modules) - there)
 """)

@@ -1,5 +1,3 @@
-"""The shape's parameters, messages, buffers, gradients and its place in a scene."""
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -145,16 +143,9 @@ def test_the_shape_has_its_bsdf_emitter_and_medium_and_says_what_it_is():
     assert dr.all(shape.bsdf().flags() & mi.BSDFFlags.DeltaTransmission != 0)
     assert shape.is_medium_transition()
     text = str(shape)
-    for line in (
-        'scheme = "catmull_clark"',
-        "tessellation_rate = 4",
-        "control_points = 8",
-        "patch_count = 6",
-        "bsdf = SmoothDielectric[",
-        "emitter = AreaLight[",
-        "interior_medium = HomogeneousMedium[",
-    ):
-        assert f"\n  {line}" in text
+    lines = ['scheme = "catmull_clark"', "tessellation_rate = 4", "control_points = 8", "patch_count = 6"]
+    lines += ["bsdf = SmoothDielectric[", "emitter = AreaLight[", "interior_medium = HomogeneousMedium["]
+    assert [line for line in lines if f"\n  {line}" not in text] == []
     assert "exterior_medium" not in text
     assert text.count("[") == text.count("]")
     parameters, before = mi.traverse(shape), vertices(shape)
@@ -179,9 +170,7 @@ def triangles(part):
 
 
 @scalar
-@pytest.mark.parametrize(
-    "given", [{"tessellation_rate": 3}, {"tessellation": "adaptive", "max_edge": 0.4}], ids=["uniform", "adaptive"]
-)
+@pytest.mark.parametrize("given", [{"tessellation_rate": 3}, {"tessellation": "adaptive", "max_edge": 0.4}], ids=str)
 def test_materials_share_their_vertices_bit_by_bit_and_unknown_ones_are_errors(tmp_path, given):
     """Of a cube, one of which is used twice, with a crease between two."""
     cube(creases=[(0, 1, 10)]).save(tmp_path / "plain.obj")
@@ -245,7 +234,6 @@ def mirrored(scale=(-1, 2, 3)):
 
 
 def placed(cage, to_world, **options):
-    """Exact points and normals in the world."""
     tessellation, matrix = LimitSurface(cage).tessellate(4, **options), np.array(to_world.matrix, dtype=np.float64)
     normals = tessellation.normals @ np.linalg.inv(matrix[:3, :3])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

@@ -1,5 +1,3 @@
-"""An update of parameters makes the shape that would be loaded with them: its buffers, its box, and its hits."""
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np

@@ -26,7 +26,6 @@ SEAMED = cube(texcoords=ISLANDS, creases=RING)
 
 
 def views_of(integrator, cage=None, **parameters):
-    """A cage under a sky, and sensors around it."""
     eyes = [[4 * np.cos(2 * view), 2, 4 * np.sin(2 * view)] for view in range(VIEWS)]
     sensors = {f"view_{view}": perspective(16, eye, up=[0, 1, 0]) for view, eye in enumerate(eyes)}
     if isinstance(integrator, str):

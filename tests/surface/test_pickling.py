@@ -1,5 +1,3 @@
-"""Cages and surfaces go to other processes, whatever they were used for before."""
-
 import copy
 import pickle
 

@@ -1,5 +1,3 @@
-"""Samples of surfaces of every kind are limit stencils times control points, and vertices of tessellations samples."""
-
 import numpy as np
 import pytest
 from kernels.surfaces import SURFACES, random_locations, surface_named

@@ -1,5 +1,3 @@
-"""What holes, collapse, the unit of length and refinement of the cage first do to all that surfaces compute."""
-
 import numpy as np
 import pytest
 from kernels.surfaces import random_locations, surface_named

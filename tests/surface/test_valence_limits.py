@@ -1,5 +1,3 @@
-"""Vertices and faces of high valence: surfaces around them, and what is refused."""
-
 import numpy as np
 import pytest
 from mitsuba_subdivision import CageError, ControlCage, LimitSurface

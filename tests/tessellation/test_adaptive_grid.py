@@ -1,5 +1,3 @@
-"""Adaptive tessellations have no cracks and no folds, and their vertices lie where they say."""
-
 import warnings
 
 import numpy as np
@@ -188,7 +186,6 @@ FOLDED = {
 
 @pytest.mark.parametrize(("cage", "is_folded"), [(cube(), False), (FOLDED["convex"], True)], ids=["cube", "folded"])
 def test_edges_are_features_where_faces_lie_back_to_back(cage, is_folded):
-    """Not where they are at right angles."""
     surface = LimitSurface(cage)
     vertex = surface.cage.cut_mesh.vertex
     frames, criterion = PatchFrames.of(surface.patches), Criterion(Measure.CHORD, 1e-3)

@@ -1,5 +1,3 @@
-"""Tessellations with texture coordinates and attributes."""
-
 import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface
@@ -55,10 +53,8 @@ def test_every_vertex_has_the_values_of_its_element_at_its_place(scheme, cage, r
     cage = bumpy(cage)
     given = with_seams(cage, np_rng, mode)
     surface = LimitSurface(given, scheme)
-    mesh, plain = (
-        surface.tessellate(rate),
-        LimitSurface(tagged(cage, creases=given.contents.creases), scheme).tessellate(rate),
-    )
+    without_seams = LimitSurface(tagged(cage, creases=given.contents.creases), scheme)
+    mesh, plain = surface.tessellate(rate), without_seams.tessellate(rate)
     assert len(mesh.normals) == len(mesh.texcoords) == len(mesh.positions) > len(plain.positions)
     np.testing.assert_array_equal(mesh.positions[mesh.triangles], plain.positions[plain.triangles])
     np.testing.assert_array_equal(mesh.normals[mesh.triangles], plain.normals[plain.triangles])
@@ -76,7 +72,6 @@ def test_every_vertex_has_the_values_of_its_element_at_its_place(scheme, cage, r
 
 
 def lattice(surface, element, rate):
-    """Corners and parameters of the samples of an element."""
     size, domain = surface.cage.face_sizes[element], surface.scheme.domain
     whole = size == domain.corner_count
     steps = np.arange(rate + 1) / rate if whole else np.append(np.arange(rate // 2 + 1) * 2 / rate, 1.0)

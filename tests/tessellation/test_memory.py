@@ -1,5 +1,3 @@
-"""Tessellations that would not fit into memory are refused before."""
-
 import os
 import re
 import subprocess
@@ -68,8 +66,7 @@ def test_the_process_s_own_limit_counts(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("cage", "scheme"),
-    [(named_cages.cube(), None), (tetrahedron(), "loop"), (named_cages.extraordinary(7), None)],
+    ("cage", "scheme"), [(named_cages.cube(), None), (tetrahedron(), "loop"), (named_cages.extraordinary(7), None)]
 )
 def test_the_rate_that_is_offered_is_the_highest_that_fits(cage, scheme, leave, monkeypatch):
     surface = LimitSurface(cage, scheme)
