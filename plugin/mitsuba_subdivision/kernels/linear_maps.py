@@ -245,7 +245,6 @@ class WeightBlocks:
         return control, control_count, row
 
     def _row(self, row: Index) -> list:
-        """Fetch a row of weights, one for each vector."""
         return self._types.row(self._weights, self._row_size, row)[: self.width]
 
 

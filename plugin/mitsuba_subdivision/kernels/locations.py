@@ -178,7 +178,6 @@ class TriangleLocations:
         return self._walk.carried(location, active) if self._leave_elements else location
 
     def _row(self, triangle: Index, active: Mask) -> tuple[Index, Index]:
-        """The half-edge that the parameters of a triangle are seen from, and their row."""
         types, walk = self._types, self._walk
         if self._half_edge is not None:
             return dr.gather(types.index, self._half_edge, triangle, active), triangle

@@ -169,7 +169,6 @@ def _forms(values: PatchValues, offset: Vector3) -> tuple[tuple[Float, Float, Fl
 
 
 def _newton(values: PatchValues, offset: Vector3, by_u: Float, by_v: Float) -> tuple[Float, Float]:
-    """Newton step for half the squared distance, from its gradient."""
     (a, b, c), (h, i, j) = _forms(values, offset)
     is_convex = (h > 0) & (h * j - i * i > CONVEX * a * c)
     damped = PARALLEL * (a + c)
@@ -181,7 +180,6 @@ def _newton(values: PatchValues, offset: Vector3, by_u: Float, by_v: Float) -> t
 
 
 def _along(values: PatchValues, offset: Vector3, by_u: Float, by_v: Float, along_u: Float, along_v: Float) -> Float:
-    """Length of the Newton step in a given direction; zero if the direction is zero."""
     first_curvature, curvature = (
         form[0] * along_u * along_u + 2 * form[1] * along_u * along_v + form[2] * along_v * along_v
         for form in _forms(values, offset)

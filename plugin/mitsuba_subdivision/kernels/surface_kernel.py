@@ -327,7 +327,6 @@ class SurfaceKernel:
         active: Mask = True,
         row: Index4 | None = None,
     ) -> Piece:
-        """The piece of the surface that contains given parameters, displaced if there is a displacement."""
         piece = self._patches.piece(coefficients, half_edge, u, v, active, row)
         return piece if self.displacement is None else self.displacement.piece(piece, half_edge, u, v, active)
 
@@ -373,7 +372,6 @@ def _sliding(
 
 
 def _normal_derivatives(values: PatchValues, n: Vector3 | None = None) -> tuple[Vector3, Vector3]:
-    """Derivatives of the unit normal ``n``, if it is known."""
     n = unit(values.normal) if n is None else n
     uu, uv, vv = values.second
     # Zero where the surface collapses: infinite derivatives times zero would be NaN.

@@ -106,7 +106,6 @@ class VertexKernel:
         return gradient if self._refinement is None else self._refinement.transposed(gradient)
 
     def _padded(self, control_points: FloatBuffer) -> FloatBuffer:
-        """Padded control points of the patches: refined if the table has a refinement."""
         points = control_points if self._refinement is None else self._refinement.product(control_points)
         return self._types.padded(points)
 

@@ -190,7 +190,6 @@ class CageAttributes:
 
 
 def _uploaded(kind: type, values: Content) -> SharedArray:
-    """Flat array of values, which meshes with equal values share."""
     # Copied to memory of Dr.Jit, as frozen functions may replace the array.
     return SharedArray(dr.opaque(mapped(kind, values.array)) if dr.is_jit_v(kind) else np.ravel(values.array))
 

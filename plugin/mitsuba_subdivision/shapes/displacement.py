@@ -161,13 +161,13 @@ class DisplacedVertices:
     def __init__(
         self,
         displacement: ShapeDisplacement,
-        parameters: Parameters,
+        surface: LimitSurface,
         layout: AttributeLayout,  # Vertices with copies along all seams, whose different displacements are averaged
         weld_target: NDArray[np.uint32] | None,  # Their `split_weld_targets`
         *,
         has_normals: bool,  # Whether the mesh has normals at its vertices
     ) -> None:
-        self._displacement, self._surface, self._has_normals = displacement, parameters.surface, has_normals
+        self._displacement, self._surface, self._has_normals = displacement, surface, has_normals
         # (n,) int64: corner of an element from which parameters are seen, a half-edge of `PatchTable.elements`; and
         # (n, 2) float64: parameters. Samples at corners of elements have (0, 0).
         self._corner, self._uv = corner, uv = layout.locate()
@@ -327,7 +327,6 @@ class TextureHeights(Heights):
         return evaluate(si, active)
 
     def _slopes(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
-        """Derivatives of the heights by s and t."""
         if not self._has_gradient:
             is_diff = dr.is_diff_v(self._variant.Float)
             return (self._derivatives if is_diff else self._differences)(s, t, active)
@@ -364,7 +363,6 @@ class TextureHeights(Heights):
         return slopes
 
     def _to_uv(self) -> FloatArray:
-        """``(2, 2)`` linear part of a bitmap's ``to_uv``."""
         parameters = mi.traverse(self._texture)
         if "to_uv" not in parameters:
             return np.eye(2)

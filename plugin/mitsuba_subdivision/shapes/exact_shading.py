@@ -105,7 +105,6 @@ class ExactShading:
         self._kept = None if triangles.kept is None else self.kernel.types.indices(triangles.kept)
 
     def _located(self, triangle: Index, b1: Float, b2: Float, active: Mask) -> Location:
-        """The location of a point of a triangle of the shape, see `TriangleLocations`."""
         if self._kept is not None:
             triangle = dr.gather(self.kernel.types.index, self._kept, triangle, active)
         return self._triangles(triangle, b1, b2, active)
@@ -267,7 +266,6 @@ class ExactShading:
         return mi.load_dict({"type": "scene", "mesh": mesh})
 
     def _is_moving(self) -> bool:
-        """Whether control points, transformation or displacement are differentiated."""
         displacement = self.kernel.displacement
         variables = [] if displacement is None else displacement.variables()
         return bool(dr.grad_enabled(self.kernel.coefficients, self.to_world, *variables))
@@ -319,7 +317,6 @@ class ExactShading:
         si.n = n
 
     def _set_parameters(self, si: mi.SurfaceInteraction3f, points: SurfacePoints, active: Mask) -> None:
-        """Set parameters or texture coordinates, and the derivatives by these."""
         variant = self._variant
         u, v = points.location.u, points.location.v
         tangents = [(points.dp_du, points.dp_dv)]

@@ -324,8 +324,6 @@ def trial_problem(
 
 
 def _triangle(variant: Variant) -> mi.Mesh:
-    """A mesh of one triangle, with attributes."""
-
     # Derived in Python like the shapes, because a C++ class has another table of virtual functions.
     class Triangle(variant.Mesh):
         """Mesh derived in Python."""

@@ -100,9 +100,9 @@ class MeshBuffers:
             from .displacement import DisplacedVertices
 
             has_normals = self._shading is None and not self._parameters.face_normals
-            weld_target = split_weld_targets(table, layout)
+            vertices = layout, split_weld_targets(table, layout)
             self._displaced = DisplacedVertices(
-                self._displacement, self._parameters, layout, weld_target, has_normals=has_normals
+                self._displacement, self._parameters.surface, *vertices, has_normals=has_normals
             )
 
     def evaluated(
@@ -142,7 +142,6 @@ class MeshBuffers:
         return self._placed(*self._kernel.attached(points, *self._evaluated), points)
 
     def _sources(self, control_points: FloatBuffer) -> list:
-        """Arrays that vertices depend on."""
         heights = [] if self._displacement is None else self._displacement.variables()
         return [control_points, self._placement.matrix, *heights]
 
@@ -170,7 +169,6 @@ class MeshBuffers:
         return self._types.gathered(flat, self._copied)
 
     def _placed(self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer) -> dict[str, FloatBuffer]:
-        """Copy, displace and place vertices, and update exact shading."""
         placement, surface, shading = self._placement, self._surface, self._shading
         positions, normals = self._split(positions), self._split(normals)
         if self._displaced is not None:

@@ -276,7 +276,6 @@ class Parameter:
 
 
 def _parameter(entry: str) -> Parameter:
-    """Read an entry of a table."""
     head, *lines = entry.splitlines()
     head, _, flags = head.partition("; ")
     head, *values = re.split(r" = | \| ", head)

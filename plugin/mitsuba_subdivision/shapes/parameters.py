@@ -171,7 +171,6 @@ def read_parameters(props: mi.Properties) -> Parameters:
 
 
 def _shown(props: mi.Properties, surface: LimitSurface) -> NDArray[np.bool_] | None:
-    """Mask of the faces to show; None for all."""
     names = [name for name in ("material", "shown_faces") if name in props]
     if not names:
         return None
@@ -291,7 +290,6 @@ def sensor_in_world(
 
 
 def _displacement(props: mi.Properties) -> tuple[Any, float]:
-    """Heights, as a texture, a name of a mesh attribute or None, and their scale."""
     scale = float(value_of(props, "displacement_scale"))
     if "displacement" not in props:
         if "displacement_scale" in props:

@@ -82,13 +82,8 @@ def make_subdivision(
             # The limit of an adaptive tessellation
             self._error = kind([0.0 if criterion is None else criterion.error])
 
-            self._placement = Placement(
-                surface.cage.positions,
-                kind,
-                self.to_world,
-                parameters.to_world,
-                recentres=parameters.evaluator == "stabilized",
-            )
+            recentres, placed = parameters.evaluator == "stabilized", (self.to_world, parameters.to_world)
+            self._placement = Placement(surface.cage.positions, kind, *placed, recentres=recentres)
             # The surface of hits and of displaced normals, and the attributes that are evaluated at hits
             on_device: SurfaceKernel | None = None
             if is_exact or (is_jit and parameters.displacement is not None):
@@ -118,26 +113,13 @@ def make_subdivision(
                 )
                 interaction_hook(variant).attach(self, self._exact)
             attributes = mesh_attributes(surface.cage)
+            exposed = [name for name in (TEXCOORDS, *attributes) if name in surface.attribute_names]
+            vertices = triangles.attributes, self._at_vertices
             self._cage = CageAttributes(
-                variant,
-                surface,
-                [name for name in (TEXCOORDS, *attributes) if name in surface.attribute_names],
-                channels,
-                self._displacement,
-                triangles.attributes,
-                self._at_vertices,
-                WeakMethod(self.renew_attribute),
+                variant, surface, exposed, channels, self._displacement, *vertices, WeakMethod(self.renew_attribute)
             )
-            self._mesh = MeshBuffers(
-                variant,
-                parameters,
-                self._placement,
-                on_device,
-                self._exact,
-                self._displacement,
-                triangles,
-                WeakMethod(self.renew_derivatives),
-            )
+            drawn = on_device, self._exact, self._displacement, triangles
+            self._mesh = MeshBuffers(variant, parameters, self._placement, *drawn, WeakMethod(self.renew_derivatives))
             self._device_state = DeviceState(self) if is_jit else None
             # Empty, because Mitsuba would convert values from a list one by one. `_assemble` sets the buffers.
             self.add_attribute("face_element", 1, [])
@@ -151,7 +133,6 @@ def make_subdivision(
             self._assemble(moves_points=False)
 
         def _triangles(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> Triangles:
-            """Select the triangles for control points and a transformation."""
             parameters, surface = self._parameters, self._parameters.surface
             is_adaptive = self._tessellation.limit is not None
             bound = self._displacement.bound(to_world) if self._displacement is not None and is_adaptive else None
@@ -162,7 +143,6 @@ def make_subdivision(
             return Triangles(table, surface.attribute_table(table, names), kept)
 
         def _assemble(self, *, moves_points: bool) -> None:
-            """Fill all buffers of the mesh."""
             buffers = self._mesh.evaluated(self.control_points, moves_points=moves_points)
             # The kernels for the vertices run while the host prepares the triangles.
             dr.eval(buffers)
@@ -318,7 +298,6 @@ def make_subdivision(
             )
 
         def _set_buffers(self, values: dict[str, FloatBuffer | IndexBuffer]) -> None:
-            """Assign buffers of the mesh."""
             if self._exact is not None or self.has_face_normals():
                 values.pop("vertex_normals", None)
             for name, member, cpp_type in traversed(variant, super().traverse):
