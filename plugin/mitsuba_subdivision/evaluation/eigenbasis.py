@@ -130,7 +130,6 @@ def eigenbasis(
 
 
 def _require_basis(matrix: FloatArray, basis: Eigenbasis) -> None:
-    """Raise EigenbasisError unless ``basis`` is the eigenbasis of a matrix."""
     size, vectors, inverse = len(matrix), basis.vectors, basis.inverse
     residuals = {
         "V L - 1": vectors @ inverse - np.eye(size),
@@ -160,7 +159,6 @@ def _clusters(eigenvalues: NDArray[np.complex128]) -> list[NDArray[np.int64]]:
 
 
 def _closest(eigenvalues: NDArray[np.complex128], clusters: list[NDArray[np.int64]]) -> str:
-    """Format the two closest eigenvalues of different clusters."""
     cluster_of = np.empty(len(eigenvalues), dtype=np.int64)
     for cluster, members in enumerate(clusters):
         cluster_of[members] = cluster

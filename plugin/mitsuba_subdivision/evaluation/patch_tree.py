@@ -144,7 +144,6 @@ class PatchTree:
 
     @cached_property
     def _below(self) -> IntArray:
-        """`nodes` without the root."""
         children = [child for child, _ in self.children]
         if not children:
             return np.empty((0, 3), dtype=np.int64)

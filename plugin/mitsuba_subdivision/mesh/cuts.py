@@ -330,7 +330,6 @@ def _differs_from_surface(mesh: SharpMesh, mode: str, seam: NDArray[np.bool_], i
 
 
 def _vary(group: IntArray, values: IntArray) -> NDArray[np.bool_]:
-    """Return whether the values of each member's group differ."""
     last = np.zeros(int(group.max(initial=-1)) + 1, dtype=np.int64)
     last[group] = values
     differs = np.zeros(len(last), dtype=bool)

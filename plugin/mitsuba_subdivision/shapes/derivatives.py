@@ -77,7 +77,6 @@ class BackwardPasses:
             )
 
     def _made(self) -> Any:
-        """Make a probe for the next update."""
         if is_recording():
             return None
         reference = ref(self)

@@ -239,7 +239,6 @@ def _mean_over_copies(weld_target: NDArray[np.uint32]) -> sparse.csr_array:
 
 
 def _columns(rows: NDArray) -> list[Float]:
-    """Columns of an array: vector components for `displaced`."""
     return [mapped(dr.scalar.ArrayXf64, column) for column in rows.T]
 
 

@@ -167,7 +167,6 @@ class ExactShading:
         self._fill_in(si, points, is_before, ray_o, ray_d, side)
 
     def _count(self, kind: Index, active: Mask) -> None:
-        """Count hits by kind and log the counts of the last kernel, at the log level Debug."""
         if mi.log_level() > mi.LogLevel.Debug:
             return
         counts = np.array(self._counts).tolist()

@@ -146,7 +146,6 @@ class MeshBuffers:
         return [control_points, self._placement.matrix, *heights]
 
     def _on_host(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        """Evaluate positions and normals in NumPy."""
         coordinates = np.array(points, dtype=np.float64).reshape(-1, 3)
         if not self._is_sampled:
             positions, normals = self.table.apply(coordinates)

@@ -117,7 +117,6 @@ def _polynomials(patches: PatchTable, grid: AdaptiveGrid) -> tuple[VertexPolynom
 
 
 def _warn_of_coarse(patches: PatchTable, needed: Tiles, tiles: Tiles, max_rate: int, cage_name: str) -> None:
-    """Warn if the rates of tiles are lower than needed."""
     is_coarse = (needed["rates"] != tiles["rates"]).any(axis=1) | (needed["sides"] != tiles["sides"]).any(axis=1)
     if not is_coarse.any():
         return
@@ -135,7 +134,6 @@ def _warn_of_coarse(patches: PatchTable, needed: Tiles, tiles: Tiles, max_rate: 
 
 
 def _whole_patches(patches: PatchTable, rates: TileRates, points: FloatArray) -> Iterator[Part]:
-    """Iterate over all patches, each as one tile."""
     table, features = patches.evaluated, feature_edges(patches, rates.frames, points, rates.criterion)
     coordinates = np.ascontiguousarray(patches.evaluated_points(points).T)
     pairs = list(zip(table.classes, table.trees, strict=True))

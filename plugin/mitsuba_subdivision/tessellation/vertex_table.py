@@ -220,7 +220,6 @@ def vertex_polynomials(
 def _of_form(
     powers: IntArray, classes: Sequence[PatchClass], polynomials: Polynomials, runs: VertexRuns
 ) -> VertexPolynomials:
-    """Collect the polynomials with the same monomials, of all classes."""
     class_of_block = np.repeat(np.arange(len(classes)), [len(rows) for rows in polynomials.rows])
     blocks = np.array([(patch_class.first_control, *patch_class.controls.shape) for patch_class in classes])
     blocks = blocks[class_of_block]
