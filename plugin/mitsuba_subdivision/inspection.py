@@ -138,7 +138,6 @@ def _attributes(cage: ControlCage) -> dict[str, str]:
 
 
 def _tessellation_size(surface: LimitSurface, rate: int) -> tuple[int, int]:
-    """Numbers of triangles and of vertices."""
     sizes = surface.patches.elements.face_sizes
     if surface.scheme.domain.corner_count == 3:
         triangles = len(sizes) * rate**2

@@ -33,16 +33,13 @@ class WorstPixel:
 
     y: int
     x: int
-    # Name of the tier that chose the pixel; "z-score" or "difference" where no tier failed or warned.
-    shown_by: str
+    shown_by: str  # The tier that chose the pixel; "z-score" or "difference" where no tier failed or warned
     # The pixel's values; those of the first batch if the paired tier chose it
     reference: tuple[float, ...]
     test: tuple[float, ...]
-    # R, G and B, and what else differs
-    names: tuple[str, ...] = RGB
-    # The first hit of the ray through the pixel, by the reference's probe, or else the test's.
-    surface: str | None = None
-    # Normal in the reference and in the test, if the probe tier chose the pixel.
+    names: tuple[str, ...] = RGB  # R, G and B, and other channels that differ
+    surface: str | None = None  # First hit of the ray through the pixel, by the reference's probe, or else the test's
+    # Normals in the reference and in the test, if the probe tier chose the pixel
     normals: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def __str__(self) -> str:
@@ -61,13 +58,11 @@ class Comparison:
     test: Image
     tiers: list[TierResult]
     tolerances: Tolerances
-    # Further results: the relative error of the whole image, files that changed, a second attempt
-    notes: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # The relative error, files that changed, a second attempt
     numbers: dict[str, Any] = field(default_factory=dict)
 
     @property
     def status(self) -> Status:
-        """The worst of the tiers'."""
         return max((tier.status for tier in self.tiers), key=list(Status).index)
 
     @cached_property
@@ -99,7 +94,7 @@ class Comparison:
         return {name: values for tier in self.tiers for name, values in tier.maps.items()}
 
     def tier(self, name: str) -> TierResult | None:
-        """Result of the tier of a name, None if that did not run."""
+        """Result of a tier, None if it did not run."""
         return next((tier for tier in self.tiers if tier.name == name), None)
 
     def __str__(self) -> str:
@@ -115,7 +110,7 @@ class Comparison:
         return [*self.notes, *([str(self.worst)] if self.worst else [])]
 
     def undecided(self) -> list[str]:
-        """What no tier decided, one text for each that warns or could not run, with its reason."""
+        """Tiers that warn or could not run, with their reasons."""
         tiers = [tier for tier in self.tiers if tier.status in (Status.WARN, Status.SKIPPED)]
         return [f"{tier.name}: {'; '.join(tier.lines)}" for tier in tiers]
 
@@ -149,22 +144,15 @@ def compare(
     An image with pixels that are not finite fails at once, and no tier runs. The tile tier also runs, and decides,
     where the paired tier cannot: the samples are not the same, or pixels differ and so does the machine or the library.
     Where the same samples give the same bits and the probe passes, the tile tier cannot fail.
-    Raises RegressionError if an image is denoised, the sizes or display windows differ, a tier is unknown, or the
-    images lack what a tier compares that was chosen.
+    Raises RegressionError for images that cannot be compared, and for tiers that are unknown or lack their channels.
     """
     for image in (reference, test):
         if image.metadata.get("denoised"):
-            raise RegressionError(
-                f'"{image.name}" is denoised, which removes what is compared; expected it as rendered'
-            )
+            raise RegressionError(f'"{image.name}" is denoised, and its noise is needed; expected it as rendered')
     if (reference.size, reference.origin) != (test.size, test.origin):
-        texts = [
-            '"{}" has {} x {} pixels (display window from x = {}, y = {})'.format(
-                image.name, *image.size, *image.origin
-            )
-            for image in (reference, test)
-        ]
-        raise RegressionError(f"{texts[0]} and {texts[1]}; expected the same window")
+        form = '"{}" has {} x {} pixels (display window from x = {}, y = {})'
+        windows = " and ".join(form.format(image.name, *image.size, *image.origin) for image in (reference, test))
+        raise RegressionError(f"{windows}; expected the same window")
     unknown = [name for name in tiers or () if name not in TIERS]
     if unknown:
         raise RegressionError(f'unknown tier "{unknown[0]}"; expected some of {", ".join(TIERS)}')
@@ -187,8 +175,8 @@ def compare(
     }
     results = {name: compared_by[name]() for name in tiers or DEFAULT_TIERS}
     _decide(results, compared_by, tiers)
-    notes, numbers = _relative_error(reference, test)
-    notes += _changed_files(reference, test)
+    note, numbers = _relative_error(reference, test)
+    notes = [note, *_changed_files(reference, test)]
     if of_missing:
         results["channels"] = of_missing
     if of_missing or names != RGB:
@@ -196,7 +184,7 @@ def compare(
     return Comparison(reference, test, list(results.values()), limits, notes, numbers)
 
 
-# What channels mean that only one of two images has.
+# Status of a comparison where only one image has some channels.
 MISSING = {"ignore": Status.PASS, "warn": Status.WARN, "fail": Status.FAIL}
 
 
@@ -223,10 +211,7 @@ def relmse(reference: NDArray[np.floating], test: NDArray[np.floating]) -> float
 def _decide(
     results: dict[str, TierResult], compared_by: dict[str, Callable[[], TierResult]], chosen: Sequence[str] | None
 ) -> None:
-    """Let other tiers decide where one cannot, and where one proves that another's finding is chance.
-
-    Raises RegressionError if a tier that was chosen cannot run, and no other stands in for it.
-    """
+    """Let other tiers decide where one cannot, and where one proves that another's finding is chance."""
     paired, is_replaced = results.get("paired"), False
     if paired and paired.status in (Status.SKIPPED, Status.WARN):
         tile = results["tile"] = results.get("tile") or compared_by["tile"]()
@@ -248,7 +233,7 @@ def _decide(
         tiles.lines.insert(0, "chance: the same samples give the same bits, and the probe passes")
 
 
-def _relative_error(reference: Image, test: Image) -> tuple[list[str], dict[str, Any]]:
+def _relative_error(reference: Image, test: Image) -> tuple[str, dict[str, Any]]:
     """The relative mean squared error, and how large noise alone would make it."""
     seen = reference.seen_with(test)
     numbers = {"relmse": relmse(reference.rgb[seen], test.rgb[seen])}
@@ -257,7 +242,7 @@ def _relative_error(reference: Image, test: Image) -> tuple[list[str], dict[str,
         estimates = (reference.estimate, test.estimate)
         a, b = (estimate.variance[..., :3] / estimate.count[..., None] for estimate in estimates)
         text += f"; noise alone would make it {np.mean(((a + b) / (reference.rgb**2 + 0.01))[seen]):.3g}"
-    return [text], numbers
+    return text, numbers
 
 
 def _changed_files(reference: Image, test: Image) -> list[str]:
