@@ -19,8 +19,7 @@ from .whole_file import remove_unfinished
 INTERRUPTED = 130
 
 T = TypeVar("T")
-# Seconds between two looks at whether the work is done.
-INTERVAL = 0.1
+INTERVAL = 0.1  # Seconds between two looks at whether the work is done
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -71,8 +70,7 @@ def interruptible(work: Callable[[], T]) -> T:
     try:
         return future.result()
     finally:
-        # An error's traceback would keep alive the objects that the work used.
-        del future
+        del future  # An error's traceback would keep alive the objects that the work used
 
 
 if __name__ == "__main__":

@@ -19,10 +19,8 @@ from .variants import variant_problem
 VARIANTS = {"scalar_rgb": True, "llvm_ad_rgb": True, "cuda_ad_rgb": False}
 PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "OpenEXR")
 DISTRIBUTION = "mitsuba-subdivision"
-# Extras for developers of this package.
-_FOR_DEVELOPERS = ("dev", "test")
-# Starting Mitsuba on a slow disk takes some seconds, and a GPU's first kernels some more.
-SECONDS = 120
+_FOR_DEVELOPERS = ("dev", "test")  # Extras for developers of this package
+SECONDS = 120  # Starting Mitsuba on a slow disk takes some seconds, and a GPU's first kernels some more
 # Height of the limit surface of a cube with corners at -1 and 1, above the middle of its face: the limit mask there,
 # applied to the vertices of the cube refined once.
 CUBE_HEIGHT = 68 / 81
@@ -33,10 +31,7 @@ _CHILD = "import json, sys; from mitsuba_subdivision import doctor; print(json.d
 
 
 def diagnose(variants: dict[str, bool] | None = None) -> dict[str, Any]:
-    """Collect versions, and render a small surface in each variant of `VARIANTS`, each in its own process.
-
-    Versions of missing packages are None.
-    """
+    """Collect versions, and render a small surface in each variant of `VARIANTS`, each in its own process."""
     from . import __version__
 
     versions = {DISTRIBUTION: __version__, "Python": platform.python_version(), **{n: _version(n) for n in PACKAGES}}

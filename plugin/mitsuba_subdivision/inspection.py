@@ -21,8 +21,7 @@ from .surface import LimitSurface
 # Above this many classes of patches their weights take longer than the rest. Semi-sharp features count for more: each
 # refinement that they outlast costs about as much as another class.
 MANY_CLASSES = 1000
-# Valences above this are seen in renders as a pinch.
-HIGH_VALENCE = 12
+HIGH_VALENCE = 12  # Valences above this are seen in renders as a pinch
 # Bytes of a mesh in single precision: position and normal of a vertex; its texture coordinates; three vertices and the
 # element of a triangle.
 VERTEX_BYTES, TEXCOORD_BYTES, TRIANGLE_BYTES = 24, 8, 16

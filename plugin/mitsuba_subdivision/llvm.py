@@ -18,10 +18,8 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, NamedTuple
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from pathlib import Path
+from typing import NamedTuple
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
 INSTALL_HINT = (
@@ -33,14 +31,8 @@ NO_USABLE_LLVM = "no LLVM library that Dr.Jit runs without aborting; see mitsuba
 
 _TOO_LATE = "Dr.Jit was imported first"
 _SYSTEM_FOLDERS = (
-    "/usr/local/lib",
-    "/usr/lib/x86_64-linux-gnu",
-    "/usr/lib/aarch64-linux-gnu",
-    "/usr/lib64",
-    "/usr/lib",
-    "/usr/lib/wsl/lib",
-    "/usr/lib/llvm-*/lib",
-    "/opt/llvm*/lib",
+    *("/usr/local/lib", "/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/usr/lib64", "/usr/lib"),
+    *("/usr/lib/wsl/lib", "/usr/lib/llvm-*/lib", "/opt/llvm*/lib"),
 )
 
 
@@ -61,10 +53,9 @@ def lowest_version() -> int:
 def select_llvm() -> LlvmChoice:
     """Choose an LLVM library and set ``DRJIT_LIBLLVM_PATH`` to it. Call it before Dr.Jit is imported.
 
-    A setting by the user has precedence. Otherwise the library comes from the extra ``mitsuba-subdivision[llvm]`` or
-    from the Python environment (as with conda), or else is the newest of the system. If all libraries found are too
-    old, LLVM variants are made to fail with an exception instead of ending the process. If none is found, or the system
-    is not Linux, Dr.Jit searches by its own rules.
+    A setting by the user has precedence. Otherwise the library comes from the extra ``mitsuba-subdivision[llvm]``, from
+    the Python environment (as with conda), or else from the system. If all libraries are too old, LLVM variants fail
+    with an exception instead of ending the process. If there is none, or no Linux, Dr.Jit searches by its own rules.
     """
     chosen = os.environ.get(ENVIRONMENT_VARIABLE)
     # A process that found no usable library leaves a note to its children.
@@ -146,8 +137,7 @@ def version_without_package() -> int | None:
 
 def best_variant() -> str:
     """Fastest variant that needs no GPU: "llvm_ad_rgb", or else "scalar_rgb", with a line on standard error."""
-    problem = llvm_problem()
-    if problem is None:
+    if (problem := llvm_problem()) is None:
         return "llvm_ad_rgb"
     sys.stderr.write(f"mitsuba-subdivision: using the slower variant scalar_rgb. {problem}.\n")
     return "scalar_rgb"
@@ -172,8 +162,7 @@ def _search() -> LlvmChoice:
 
 def _known_version(path: str) -> int:
     """Major version of a library by its name, or else by the library itself; 0 if it is not an LLVM library."""
-    version = library_version(path)
-    if version is not None:
+    if (version := library_version(path)) is not None:
         return version
     try:
         library = ctypes.CDLL(path)

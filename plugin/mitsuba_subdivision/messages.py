@@ -14,8 +14,7 @@ from contextlib import contextmanager, suppress
 from typing import TextIO, TypeVar
 
 PROGRAM = "mitsuba-subdivision"
-# Seconds before a line of progress appears.
-PATIENCE = 1.0
+PATIENCE = 1.0  # Seconds before a line of progress appears
 # Errors that wrong input can raise. Any other error is a defect of this package, and keeps its traceback.
 USER_ERRORS = (ValueError, OSError, RuntimeError, MemoryError)
 
@@ -61,8 +60,7 @@ def flushed_output() -> Iterator[None]:
 
 def counted(items: Sequence[T], what: str) -> Iterator[T]:
     """Iterate over items, and count them on a terminal after ``what`` they are."""
-    # Only here, as it takes some time to import.
-    from tqdm import tqdm
+    from tqdm import tqdm  # Only here, as it takes some time to import
 
     return iter(tqdm(items, desc=what, leave=False, delay=PATIENCE, disable=not _is_terminal()))
 

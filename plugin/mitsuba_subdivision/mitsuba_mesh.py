@@ -76,7 +76,6 @@ class PolygonMesh:
         return {"type": "ply", "mesh": self, **facets, "bsdf": bsdf, **shining}
 
     def loaded(self, bsdf: mi.BSDF | None, emitter: mi.Emitter | None, interior: mi.Medium | None = None) -> mi.Mesh:
-        """The mesh as an object of Mitsuba."""
         return mitsuba_mesh(self.name, self.triangles, self.vertices, bsdf=bsdf, emitter=emitter, interior=interior)
 
     def save(self, path: Path) -> None:

@@ -14,8 +14,7 @@ from .llvm import best_variant, llvm_problem, loaded_version, require_llvm
 
 # The module of a variant, such as mitsuba.llvm_ad_rgb. For mypy, a class of a `ModuleType` is no base class.
 Variant: TypeAlias = Any
-# A scene or an entry of one, as `mi.load_dict` takes it.
-SceneNode = dict[str, Any]
+SceneNode = dict[str, Any]  # A scene or an entry of one, as `mi.load_dict` takes it
 # Threads with which Mitsuba reads and writes OpenEXR files: one that waits, and one that works.
 OPENEXR_THREADS = 2
 EXPECTED = 'the module mitsuba with a variant set, a variant such as mitsuba.llvm_ad_rgb, or its name, "llvm_ad_rgb"'

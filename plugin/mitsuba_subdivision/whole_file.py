@@ -39,10 +39,12 @@ def whole_file(path: str | Path) -> Iterator[Path]:
                 os.fsync(stream.fileno())
             beside.replace(path)
         except (OSError, RuntimeError) as error:
-            renamed = _about(path, beside, error)
-            if renamed is error:
+            if isinstance(error, OSError) and error.errno and str(error.filename or beside) == str(beside):
+                raise type(error)(error.errno, error.strerror, str(path)) from error
+            text = str(error).replace(str(beside), str(path))
+            if text == str(error):
                 raise
-            raise renamed from error
+            raise OSError(text) from error
 
 
 def write_text(path: Path, text: str) -> None:
@@ -100,11 +102,3 @@ def _temporary(path: Path) -> Iterator[Path]:
         with suppress(OSError):
             beside.unlink(missing_ok=True)
         _unfinished.discard(beside)
-
-
-def _about(path: Path, beside: Path, error: Exception) -> Exception:
-    """The error, with the user's file name instead of the temporary one."""
-    if isinstance(error, OSError) and error.errno and (error.filename is None or str(error.filename) == str(beside)):
-        return type(error)(error.errno, error.strerror, str(path))
-    text = str(error).replace(str(beside), str(path))
-    return error if text == str(error) else OSError(text)

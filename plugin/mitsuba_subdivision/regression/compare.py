@@ -12,19 +12,7 @@ from numpy.typing import NDArray
 
 from . import RegressionError
 from .image import RGB, Image
-from .tiers import (
-    DEFAULT_TIERS,
-    TIERS,
-    Status,
-    TierResult,
-    Tolerances,
-    compare_flip,
-    compare_paired,
-    compare_probes,
-    compare_tiles,
-    levels,
-    pixel_of_largest,
-)
+from .tiers import DEFAULT_TIERS, TIERS, Status, TierResult, Tolerances, compare_tier, levels, pixel_of_largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,12 +73,10 @@ class Comparison:
 
     @property
     def exit_status(self) -> int:
-        """0 for pass, 1 for warn, 2 for fail."""
         return {Status.PASS: 0, Status.WARN: 1, Status.FAIL: 2}[self.status]
 
     @property
     def maps(self) -> dict[str, NDArray[np.floating]]:
-        """Maps of all tiers, by their names."""
         return {name: values for tier in self.tiers for name, values in tier.maps.items()}
 
     def tier(self, name: str) -> TierResult | None:
@@ -106,7 +92,6 @@ class Comparison:
         return "\n".join([*lines, *(f"  {line}" for line in self.remarks())])
 
     def remarks(self) -> list[str]:
-        """The notes, and the worst pixel in words."""
         return [*self.notes, *([str(self.worst)] if self.worst else [])]
 
     def undecided(self) -> list[str]:
@@ -115,7 +100,6 @@ class Comparison:
         return [f"{tier.name}: {'; '.join(tier.lines)}" for tier in tiers]
 
     def as_dict(self) -> dict[str, Any]:
-        """The comparison as plain values, for JSON."""
         return {
             "status": self.status.value,
             "reference": self.reference.name,
@@ -153,30 +137,29 @@ def compare(
         form = '"{}" has {} x {} pixels (display window from x = {}, y = {})'
         windows = " and ".join(form.format(image.name, *image.size, *image.origin) for image in (reference, test))
         raise RegressionError(f"{windows}; expected the same window")
-    unknown = [name for name in tiers or () if name not in TIERS]
-    if unknown:
+    if unknown := [name for name in tiers or () if name not in TIERS]:
         raise RegressionError(f'unknown tier "{unknown[0]}"; expected some of {", ".join(TIERS)}')
     limits = tolerances or Tolerances().with_values(reference.metadata.get("tolerances", {}))
 
     for image, role in ((test, "test"), (reference, "reference")):
-        broken = image.not_finite()
-        if broken:
+        if broken := image.not_finite():
             result = TierResult("finite", Status.FAIL, [f"the {role} is not: {broken[0]}"], worst=broken[1])
             return Comparison(reference, test, [result], limits)
 
     names = tuple(name for name in reference.names if name in test.names)
     of_missing = _missing(reference, test, missing)
     reference, test = (image.with_channels(names) for image in (reference, test))
-    compared_by: dict[str, Callable[[], TierResult]] = {
-        "probe": lambda: compare_probes(reference, test, limits),
-        "paired": lambda: compare_paired(reference, test, limits),
-        "tile": lambda: compare_tiles(reference, test, limits, suite_size),
-        "flip": lambda: compare_flip(reference, test, limits),
-    }
-    results = {name: compared_by[name]() for name in tiers or DEFAULT_TIERS}
-    _decide(results, compared_by, tiers)
+
+    def compared(name: str) -> TierResult:
+        return compare_tier(name, reference, test, limits, suite_size)
+
+    results = {name: compared(name) for name in tiers or DEFAULT_TIERS}
+    _decide(results, compared, tiers)
     note, numbers = _relative_error(reference, test)
-    notes = [note, *_changed_files(reference, test)]
+    notes, before, now = [note], *(image.metadata.get("files") or {} for image in (reference, test))
+    changed = sorted(n for n in {*before, *now} if before.get(n) != now.get(n))
+    if before and now and changed:
+        notes.append(f"changed since the reference was made: {', '.join(changed)}")
     if of_missing:
         results["channels"] = of_missing
     if of_missing or names != RGB:
@@ -197,8 +180,7 @@ def _missing(reference: Image, test: Image, meaning: str) -> TierResult | None:
         only = [name for name in image.names if name not in other.names]
         lines += [f"only the {role} has {', '.join(only)}"] if only else []
     if lines and meaning == "warn" and "sampling" in reference.metadata and "channels" not in reference.metadata:
-        # It stays as good as it was.
-        status = Status.PASS
+        status = Status.PASS  # It stays as good as it was
         lines.append("the reference is of an older version, which stored R, G, B: make it again to compare all")
     return TierResult("channels", status, lines) if lines else None
 
@@ -209,19 +191,19 @@ def relmse(reference: NDArray[np.floating], test: NDArray[np.floating]) -> float
 
 
 def _decide(
-    results: dict[str, TierResult], compared_by: dict[str, Callable[[], TierResult]], chosen: Sequence[str] | None
+    results: dict[str, TierResult], compared: Callable[[str], TierResult], chosen: Sequence[str] | None
 ) -> None:
     """Let other tiers decide where one cannot, and where one proves that another's finding is chance."""
     paired, is_replaced = results.get("paired"), False
     if paired and paired.status in (Status.SKIPPED, Status.WARN):
-        tile = results["tile"] = results.get("tile") or compared_by["tile"]()
+        tile = results["tile"] = results.get("tile") or compared("tile")
         is_replaced = tile.status is not Status.SKIPPED
         if is_replaced:
             paired.lines.append("the tile tier decides instead")
         elif paired.status is Status.WARN:
             paired.status = Status.FAIL
     if chosen is None and all(result.status is Status.SKIPPED for name, result in results.items() if name != "probe"):
-        results["flip"] = compared_by["flip"]()
+        results["flip"] = compared("flip")
     for result in results.values():
         cannot_run = result.status is Status.SKIPPED and not (result is paired and is_replaced)
         if cannot_run and result.name in (chosen or ()):
@@ -243,12 +225,6 @@ def _relative_error(reference: Image, test: Image) -> tuple[str, dict[str, Any]]
         a, b = (estimate.variance[..., :3] / estimate.count[..., None] for estimate in estimates)
         text += f"; noise alone would make it {np.mean(((a + b) / (reference.rgb**2 + 0.01))[seen]):.3g}"
     return text, numbers
-
-
-def _changed_files(reference: Image, test: Image) -> list[str]:
-    before, now = (image.metadata.get("files") or {} for image in (reference, test))
-    changed = sorted(n for n in {*before, *now} if before.get(n) != now.get(n)) if before and now else []
-    return [f"changed since the reference was made: {', '.join(changed)}"] if changed else []
 
 
 def _worst_pixel(reference: Image, test: Image, pixel: tuple[int, int], shown_by: str) -> WorstPixel:

@@ -31,8 +31,7 @@ from .tiers import Status, Tolerances
 CLAIMS = pytest.StashKey[dict[Path, tuple[str, str]]]()
 TOO_LATE = "mitsuba was imported before mitsuba_subdivision, which would have found it an LLVM library;"
 NAME = "expected another name=.. for one of them"
-# Parameters of the scene's file, and which of its sensors renders.
-_Settings = tuple[dict[str, str], int]
+_Settings = tuple[dict[str, str], int]  # Parameters of the scene's file, and which of its sensors renders
 
 
 class RenderRegression:

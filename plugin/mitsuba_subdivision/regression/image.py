@@ -20,8 +20,7 @@ from . import ContentElsewhere, RegressionError
 
 SCHEMA = 1
 METADATA_ATTRIBUTE = "mitsuba_subdivision:metadata"
-# Index that stands for no shape, no triangle or no element.
-NOTHING = 2**32 - 1
+NOTHING = 2**32 - 1  # Index that stands for no shape, no triangle or no element
 
 Channels = dict[str, NDArray]
 
@@ -42,9 +41,8 @@ _quieting = threading.Lock()
 class Estimate:
     """Pixels estimated from batches of samples.
 
-    A batch is a small render of its own. The variance of a sample is the variance of the batches' means, times the
-    samples in a batch. That stays right where the samples of a batch depend on each other, as with stratified samplers,
-    and a renderer needs to output images only.
+    The variance of a sample is the variance of the batches' means, times the samples in a batch. That stays right where
+    the samples of a batch depend on each other, as with stratified samplers.
     """
 
     mean: NDArray[np.float64]  # (height, width, channels)
@@ -71,8 +69,7 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
     The sums of squares are updated pairwise [Chan et al. 1979], without the cancellation of ``E[x^2] - E[x]^2``.
     """
     rest = iter(estimates)
-    total = next(rest, None)
-    if total is None:
+    if (total := next(rest, None)) is None:
         raise RegressionError("there is nothing to combine")
     squares = total.variance * max(total.batches - 1, 0)
     for estimate in rest:
@@ -107,11 +104,9 @@ class Probe:
 
     @property
     def hit(self) -> NDArray[np.bool_]:
-        """Pixels whose ray hits something."""
         return self.shape != NOTHING
 
     def channels(self) -> Channels:
-        """Channels of an OpenEXR file."""
         return {
             f"{_OF_PROBE}{channel}": values
             for name, names in _PROBE.items()
@@ -140,7 +135,7 @@ class Image:
     paired: NDArray[np.float64] | None = None
     probe: Probe | None = None
     metadata: dict[str, Any] = field(default_factory=dict)  # How the image was made
-    names: tuple[str, ...] = RGB  # Of the channels
+    names: tuple[str, ...] = RGB  # Channels
     # First column and row of the display window of a file, and which of its pixels have data; None for all.
     origin: tuple[int, int] = (0, 0)
     has_data: NDArray[np.bool_] | None = None
@@ -161,7 +156,6 @@ class Image:
         return self.pixels[..., :3]
 
     def with_channels(self, names: tuple[str, ...]) -> Image:
-        """The image with some of its channels only."""
         at, estimate = [self.names.index(name) for name in names], self.estimate
         if estimate is not None:
             estimate = replace(estimate, mean=estimate.mean[..., at], variance=estimate.variance[..., at])
@@ -169,7 +163,6 @@ class Image:
         return replace(self, pixels=self.pixels[..., at], estimate=estimate, paired=paired, names=names)
 
     def channels(self) -> Channels:
-        """Channels of an OpenEXR file, in single precision."""
         channels = _named("", self.pixels, self.names)
         if self.estimate is not None:
             channels |= _named("variance.", self.estimate.variance, self.names) | {"N": self.estimate.count}

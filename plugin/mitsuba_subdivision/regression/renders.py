@@ -27,8 +27,7 @@ from .image import NOTHING, Estimate, Image, Probe, combine, load_image, require
 from .scene import SEEDS, LoadedScene, SceneSource, load_scene, render_pixels
 from .tiers import Status, Tolerances
 
-# Samples per pixel of a batch.
-BATCH = 64
+BATCH = 64  # Samples per pixel of a batch
 # Fewer batches than these measure the variance badly.
 LEAST_BATCHES = 4
 _OF_SAMPLING = ("seed", "batch", "total")
@@ -46,7 +45,7 @@ class Sampling:
 
     @classmethod
     def of_spp(cls, spp: int, batch: int = BATCH, seed: int = 0) -> Sampling:
-        """At least ``spp`` samples in whole batches, of which there are at least `LEAST_BATCHES`."""
+        """At least ``spp`` samples in whole batches, at least `LEAST_BATCHES`."""
         batch = min(batch, max(1, spp // LEAST_BATCHES))
         return cls(max(LEAST_BATCHES, -(-spp // batch)), batch, seed)
 
@@ -198,7 +197,7 @@ def probe_scene(loaded: LoadedScene) -> Probe:
     )
     position, normal, uv = (np.where(valid, vector, 0).astype(np.float32) for vector in vectors)
     valid, triangle = valid[..., 0], np.where(valid, triangle, NOTHING)[..., 0].astype(np.uint32)
-    # Indices of the shapes, and faces of the cages of those that have one.
+    # Indices of shapes, and faces of their cages.
     shape, element = (np.full((height, width), NOTHING, dtype=np.uint32) for _ in range(2))
     for index, candidate in enumerate(shapes):
         at = valid & (identity == order[index]).reshape(height, width)
@@ -215,8 +214,7 @@ REFERENCE_SPP = 16384
 # The seeds of a test are this far from the reference's, so that the samples differ; those of other tests and of second
 # attempts are as far from each other.
 SEED_STEP = 2**20
-# Samples of the second attempt, in samples of the first.
-RETRY_FACTOR = 4
+RETRY_FACTOR = 4  # Samples of the second attempt, in samples of the first
 
 
 def as_reference(image: Image, scene: Path | None, path: str | Path, tolerances: Tolerances) -> Image:

@@ -118,7 +118,7 @@ def _maps(comparison: Comparison) -> dict[str, NDArray[np.floating]]:
             maps |= compare_flip(comparison.reference, comparison.test, comparison.tolerances).maps
     reference, test = comparison.reference, comparison.test
     others = {name: test.pixels[..., i] - reference.pixels[..., i] for i, name in enumerate(reference.names) if i > 2}
-    # Alpha, and those that differ most.
+    # Alpha, and the channels that differ most.
     order = sorted(others, key=lambda name: (name != "A", -np.abs(others[name]).mean()))
     return maps | {f"difference of {name}": others[name] for name in order[:MOST_OTHERS]}
 

@@ -26,8 +26,7 @@ SceneSource = Union[str, Path, Mapping[str, Any], "mi.Scene"]
 # differ too much from part to part.
 PART_SAMPLES = 1 << 22
 LEAST_PART_SPP = 16
-# Seeds of Mitsuba have 32 bits.
-SEEDS = 2**32
+SEEDS = 2**32  # Seeds of Mitsuba have 32 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +66,6 @@ class LoadedScene:
 
     @property
     def file_paths(self) -> list[Path]:
-        """The scene's file, and all files that the scene names."""
         return [self.path.resolve().parent / name for name in self.files] if self.path else []
 
     @property
@@ -184,7 +182,7 @@ def _checksums(path: Path, state: mi.parser.ParserState) -> dict[str, str]:
         for key, value in node.props.items():
             if node.props.type(key) == mi.Properties.Type.String:
                 named = Path(str(_file_resolver().resolve(value)))
-                # Of a text longer than any name, `Path.is_file` raises an error.
+                # `Path.is_file` raises an error for a text that is longer than any name.
                 if value and os.path.isfile(named):
                     files.add(named.resolve())
     digests = {file: hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(files)}

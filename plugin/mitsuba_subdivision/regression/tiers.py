@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from . import RegressionError
 from .image import Estimate, Image
 
-__all__ = ["DEFAULT_TIERS", "TIERS", "Status", "TierResult", "Tolerances"]
-
 # Names, and what each compares.
 TIERS = {
     "probe": "what the rays through the centres of the pixels hit",
@@ -38,15 +36,13 @@ _SAME_SAMPLES, _IF_KNOWN = ("variant", "filter", "paired"), ("sampler", "sensor"
 SCALES: tuple[int | None, ...] = (4, 8, 16, None)
 # Samples that a reference should have for each of the test's, so that its own noise hardly counts.
 REFERENCE_SAMPLES = 16
-# Side of the tiles that measure how much noisier the test is than the reference.
-NOISE_TILE = 4
+NOISE_TILE = 4  # Side of the tiles that measure how much noisier the test is than the reference
 # Mitsuba's spectra of a colour miss it by up to this part of its largest value; measured for 18 colours.
 SPECTRA = 5e-4
 # Part of the variance that images with all samples in common keep at least. If all noise of a pixel is that of a single
 # bright path, and rounding sends it elsewhere, then the difference is 1 / sqrt(0.1) = 3.2 standard errors.
 LEAST_NOISE = 0.1
-# More degrees of freedom make no difference.
-_MOST_FREEDOM = 1e12
+_MOST_FREEDOM = 1e12  # More degrees of freedom make no difference
 
 # What FLIP's tone curve, ACES, maps to 0.85, the value that limits its exposures; and weights of R, G and B.
 _BRIGHT = 2.118872324
@@ -300,8 +296,7 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
     images that have their samples in common, the noise is what rounding leaves. `_z_scores` has the formulas.
 
     Single precision adds a bias, and so do spectra of colours: the standard error has a floor for that. Šidák's
-    correction covers the tiles and channels of a scale, Bonferroni's the scales and the scenes of a suite, of which
-    there are ``suite_size``.
+    correction covers the tiles and channels of a scale, Bonferroni's the scales and the scenes of a suite.
     """
     expected, tested = reference.estimate, test.estimate
     if expected is None or tested is None:
@@ -321,7 +316,7 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
     are_spectral = {"spectral" in image.metadata.get("variant", "") for image in (reference, test)}
     if len(are_spectral) > 1:
         floor[..., :3] += SPECTRA * np.abs(reference.rgb).max(axis=2, keepdims=True)
-    # Where the test is noisier in most tiles, it is so in those that missed rare paths.
+    # A test that is noisier in most tiles is so in tiles that missed rare paths.
     own, others = (_tile_sums(estimate.variance, NOISE_TILE) for estimate in (tested, expected))
     noisier = np.median(own[others > 0] / others[others > 0]) if others.any() else 1
     least = max(1.0, float(noisier)) * expected.variance
@@ -471,3 +466,11 @@ def _errors_of_others(reference: Image, test: Image) -> dict[str, NDArray[np.flo
         size = 1.0 if name.rpartition(".")[2] == "A" else np.maximum(np.maximum(a, b), least)
         errors[name] = np.abs(test.pixels[..., i] - reference.pixels[..., i]) / size
     return errors
+
+
+def compare_tier(name: str, reference: Image, test: Image, tolerances: Tolerances, suite_size: int) -> TierResult:
+    """Compare two images by a tier of `TIERS`."""
+    if name == "tile":
+        return compare_tiles(reference, test, tolerances, suite_size)
+    compared = {"probe": compare_probes, "paired": compare_paired, "flip": compare_flip}[name]
+    return compared(reference, test, tolerances)
