@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -25,44 +25,20 @@ _REPORTED = pytest.StashKey[Path]()
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the options ``--render-..``, and ``render_..`` in the configuration file."""
-    group = parser.getgroup("render differences", "render-difference tests (mitsuba-subdivision)")
-    group.addoption(
-        "--render-update",
-        dest="render_update",
-        action="store_const",
-        const="failing",
-        default="no",
-        help="write the references that are missing or do not match, and fail their tests",
-    )
-    group.addoption(
-        "--render-update-all",
-        dest="render_update",
-        action="store_const",
-        const="all",
-        help="write all references, and compare nothing",
-    )
-    group.addoption(
-        "--render-spp-scale",
-        type=_positive,
-        default=1.0,
-        metavar="FACTOR",
-        help="factor on the samples per pixel of tests, not of references (default: %(default)s)",
-    )
-    group.addoption("--render-results", metavar="DIR", help="folder for the renders and reports of comparisons")
-    group.addoption(
-        "--render-report",
-        choices=["failures", "all", "none"],
-        default="failures",
-        help="which comparisons get a report: page, numbers and maps (default: %(default)s)",
-    )
-    parser.addini(
-        "render_references", "folder of the references, relative to the root folder", default="renders/references"
-    )
-    parser.addini(
-        "render_results",
-        "folder for renders and reports of comparisons, relative to the root folder",
-        default="renders/failures",
-    )
+    add = parser.getgroup("render differences", "render-difference tests (mitsuba-subdivision)").addoption
+    update: dict[str, Any] = {"dest": "render_update", "action": "store_const"}
+    text = "write the references that are missing or do not match, and fail their tests"
+    add("--render-update", const="failing", default="no", help=text, **update)
+    add("--render-update-all", const="all", help="write all references, and compare nothing", **update)
+    text = "factor on the samples per pixel of tests, not of references (default: %(default)s)"
+    add("--render-spp-scale", type=_positive, default=1.0, metavar="FACTOR", help=text)
+    add("--render-results", metavar="DIR", help="folder for the renders and reports of comparisons")
+    text = "which comparisons get a report: page, numbers and maps (default: %(default)s)"
+    add("--render-report", choices=["failures", "all", "none"], default="failures", help=text)
+    text = "folder of the references, relative to the root folder"
+    parser.addini("render_references", text, default="renders/references")
+    text = "folder for renders and reports of comparisons, relative to the root folder"
+    parser.addini("render_results", text, default="renders/failures")
 
 
 def _positive(text: str) -> float:

@@ -8,7 +8,8 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from concurrent.futures import ThreadPoolExecutor, wait
+from typing import TypeVar
 
 from .cage import CageWarning
 from .commands import parser
@@ -18,8 +19,7 @@ from .whole_file import remove_unfinished
 INTERRUPTED = 130
 
 T = TypeVar("T")
-# Seconds between two looks at whether the work is done.
-INTERVAL = 0.1
+INTERVAL = 0.1  # Seconds between two looks at whether the work is done
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _abandon() -> None:
-    """End the process: work that Ctrl-C interrupts goes on in its thread, which nothing else stops."""
+    # Interrupted work goes on in its thread, which nothing else than the end of the process stops.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     remove_unfinished()
     print_remark("interrupted")
@@ -57,33 +57,20 @@ def interruptible(work: Callable[[], T]) -> T:
     """
     if threading.current_thread() is not threading.main_thread():
         return work()
-    outcome: dict[str, Any] = {}
-
-    def run() -> None:
-        try:
-            outcome["result"] = work()
-        except BaseException as error:  # Raised below, in the thread that waits.
-            outcome["error"] = error
-
-    context = contextvars.copy_context()
-    thread = threading.Thread(target=lambda: context.run(run), name="work", daemon=True)
-    handler = signal.getsignal(signal.SIGINT)
+    executor, handler = ThreadPoolExecutor(1), signal.getsignal(signal.SIGINT)
     try:
-        thread.start()
-        while thread.is_alive():
-            thread.join(INTERVAL)
+        future = executor.submit(contextvars.copy_context().run, work)
+        while wait([future], INTERVAL).not_done:
             # During a render, Mitsuba installs a handler of its own, which waits for the end of the render.
             if handler is not None:
                 signal.signal(signal.SIGINT, handler)
     except KeyboardInterrupt:
         _abandon()
-    if "error" in outcome:
-        try:
-            raise outcome["error"]
-        finally:
-            # The error's traceback would keep alive the objects that the work used.
-            outcome.clear()
-    return outcome["result"]
+    executor.shutdown()
+    try:
+        return future.result()
+    finally:
+        del future  # An error's traceback would keep alive the objects that the work used
 
 
 if __name__ == "__main__":

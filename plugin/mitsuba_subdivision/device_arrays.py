@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from .llvm import require_llvm
 
-# Bytes of two packets of the widest numbers that kernels load, and of what is aligned for kernels: Dr.Jit compiles
-# one kernel for aligned arrays and another one for others.
+# Bytes of two packets of the widest numbers that kernels load, and of the alignment of arrays: Dr.Jit compiles one
+# kernel for aligned arrays and another one for others.
 PACKETS, CACHE_LINE = 256, 64
 
 
@@ -78,9 +78,6 @@ def mapped(kind: type, *parts: ArrayLike) -> Any:
 
 
 def take_over(array: Any) -> None:
-    """Move an array of Dr.Jit to Dr.Jit's own memory, in place.
-
-    For arrays that users assign to parameters: they are often made of NumPy's. One with derivatives stays where it is.
-    """
+    """Move an array that a user assigns to Dr.Jit's own memory, in place, unless it has derivatives."""
     if dr.is_jit_v(array) and not dr.grad_enabled(array):
         array[:] = dr.opaque(array)

@@ -15,14 +15,12 @@ from typing import Any
 from .llvm import loaded_version, lowest_version, select_llvm, version_without_package
 from .variants import variant_problem
 
-# Variants that are tried, and whether a machine is expected to have what they need.
+# Variants to try, and whether a machine without a device for them is a problem.
 VARIANTS = {"scalar_rgb": True, "llvm_ad_rgb": True, "cuda_ad_rgb": False}
 PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "OpenEXR")
 DISTRIBUTION = "mitsuba-subdivision"
-# Extras for developers of this package.
-_FOR_DEVELOPERS = ("dev", "test")
-# Starting Mitsuba on a slow disk takes some seconds, and a GPU's first kernels some more.
-SECONDS = 120
+_FOR_DEVELOPERS = ("dev", "test")  # Extras for developers of this package
+SECONDS = 120  # Starting Mitsuba on a slow disk takes some seconds, and a GPU's first kernels some more
 # Height of the limit surface of a cube with corners at -1 and 1, above the middle of its face: the limit mask there,
 # applied to the vertices of the cube refined once.
 CUBE_HEIGHT = 68 / 81
@@ -32,14 +30,8 @@ TOLERANCE = 1e-5
 _CHILD = "import json, sys; from mitsuba_subdivision import doctor; print(json.dumps(doctor._report(sys.argv[1])))"
 
 
-def diagnose(
-    # Names of variants, and whether one that the machine has no device for is a problem. By default `VARIANTS`.
-    variants: dict[str, bool] | None = None,
-) -> dict[str, Any]:
-    """Collect versions, and render a small surface in each variant, each in its own process: facts for a bug report.
-
-    Versions of packages that are missing are None.
-    """
+def diagnose(variants: dict[str, bool] | None = None) -> dict[str, Any]:
+    """Collect versions, and render a small surface in each variant of `VARIANTS`, each in its own process."""
     from . import __version__
 
     versions = {DISTRIBUTION: __version__, "Python": platform.python_version(), **{n: _version(n) for n in PACKAGES}}
@@ -47,13 +39,10 @@ def diagnose(
     return {
         "versions": versions,
         "machine": platform.platform(),
-        # Which LLVM library this package has chosen, and why.
         "llvm": select_llvm()._asdict(),
-        # Major version of the library that programs get which import Mitsuba first; None if there is none.
         "late_llvm": version_without_package(),
         "variants": tried,
         "extras": _extras(),
-        # Whether everything works that the machine should support.
         "healthy": None not in versions.values() and all(report["works"] is not False for report in tried.values()),
     }
 
@@ -84,16 +73,12 @@ def in_words(diagnosis: dict[str, Any]) -> str:
     return "\n".join([*(f"{name:{width}}  {text}" for name, text in lines), verdict])
 
 
-def try_variant(
-    variant: str,
-    needed: bool = True,  # Whether it is a problem if the machine has no device for it
-    seconds: float = SECONDS,  # After which the process is ended
-) -> dict[str, Any]:
-    """Render a small surface in a separate process, so that a crash is reported.
+def try_variant(variant: str, needed: bool = True, seconds: float = SECONDS) -> dict[str, Any]:
+    """Render a small surface in a separate process, so that a crash is reported; end it after some seconds.
 
-    Returns "works", whether a surface is rendered at the right place, None if the machine lacks what it needs and need
-    not have it; "problem", why not; "exact_shading" and "exact_problem" likewise; "llvm", the major version of the
-    library that Dr.Jit has loaded; and "seconds", from the start of the process to its end.
+    "works" says whether the surface is at the right place, and is None if the machine has no device for a variant that
+    is not needed; "problem" says why not; "exact_shading" and "exact_problem" likewise. "llvm" is the major version of
+    the library that Dr.Jit has loaded.
     """
     start = time.monotonic()
     report = _in_process(variant, seconds)
@@ -104,7 +89,6 @@ def try_variant(
 
 
 def _in_process(variant: str, seconds: float) -> dict[str, Any]:
-    """What another process reports of a variant, or how it ended."""
     command = [sys.executable, "-c", _CHILD, variant]
     try:
         done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=seconds, check=False)
@@ -122,7 +106,7 @@ def _in_process(variant: str, seconds: float) -> dict[str, Any]:
 
 
 def _report(variant: str) -> dict[str, Any]:
-    """What `try_variant` returns, from a trial in this process."""
+    """As `try_variant`, in this process."""
     import mitsuba as mi
 
     from .shapes.interaction_hook import exact_shading_problem
@@ -141,18 +125,7 @@ def _report(variant: str) -> dict[str, Any]:
 
 
 def _problem(**parameters: Any) -> str | None:
-    """What is wrong with a render of the limit surface of a cube, in one line; None if nothing is."""
-    try:
-        height = _rendered_height(**parameters)
-    except Exception as error:
-        return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[-1]}"
-    if abs(height - CUBE_HEIGHT) <= TOLERANCE:
-        return None
-    return f"the limit surface of a cube was rendered at the height {height:.6f}; expected {CUBE_HEIGHT:.6f}"
-
-
-def _rendered_height(**parameters: Any) -> float:
-    """Height of a cube's limit surface above the middle of its face, by a render of one pixel."""
+    """What is wrong with the limit surface of a cube in a render of one pixel, in one line; None if nothing is."""
     import mitsuba as mi
 
     from .cage.named_cages import cube
@@ -166,7 +139,13 @@ def _rendered_height(**parameters: Any) -> float:
         "sensor": {"type": "orthographic", "to_world": camera, "film": film},
         "surface": {"type": "subdivision", **cube().as_properties(mi), **parameters},
     }
-    return float(mi.TensorXf(mi.render(mi.load_dict(scene), spp=1)).array[2])
+    try:
+        height = float(mi.TensorXf(mi.render(mi.load_dict(scene), spp=1)).array[2])
+    except Exception as error:
+        return f"{type(error).__name__}: {(str(error).strip().splitlines() or [''])[-1]}"
+    if abs(height - CUBE_HEIGHT) <= TOLERANCE:
+        return None
+    return f"the limit surface of a cube was rendered at the height {height:.6f}; expected {CUBE_HEIGHT:.6f}"
 
 
 def _version(package: str) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -20,22 +21,17 @@ from .surface import LimitSurface
 # Above this many classes of patches their weights take longer than the rest. Semi-sharp features count for more: each
 # refinement that they outlast costs about as much as another class.
 MANY_CLASSES = 1000
-# Valences above this are seen in renders as a pinch.
-HIGH_VALENCE = 12
+HIGH_VALENCE = 12  # Valences above this are seen in renders as a pinch
 # Bytes of a mesh in single precision: position and normal of a vertex; its texture coordinates; three vertices and the
 # element of a triangle.
 VERTEX_BYTES, TEXCOORD_BYTES, TRIANGLE_BYTES = 24, 8, 16
 
 
-def inspect(
-    surface: LimitSurface,
-    rate: int = 8,  # Segments per edge of the tessellation whose size is predicted, at least 1
-) -> dict[str, Any]:
-    """Inspect a cage under a scheme: plain values by name. Raises ValueError if the rate is below 1."""
+def inspect(surface: LimitSurface, rate: int = 8) -> dict[str, Any]:
+    """Describe a cage under a scheme, and its tessellation with ``rate`` segments per edge, by plain values."""
     if rate < 1:
         raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
-    cage = surface.cage
-    t = cage.topology
+    cage, t = surface.cage, surface.cage.topology
     used = cage.positions[t.face_vertices]
     rules = {name: getattr(cage, name) for name in RULES}
     triangle_count, vertex_count = _tessellation_size(surface, rate)
@@ -46,33 +42,27 @@ def inspect(
         "vertex_count": cage.vertex_count,
         "edge_count": len(cage.edges),
         "face_count": cage.face_count,
-        # Connected parts that share no vertex.
         "component_count": _piece_count(t, np.arange(t.half_edge_count)),
-        # Least and greatest coordinates of the control points that faces have.
         "bounding_box": (used.min(axis=0).tolist(), used.max(axis=0).tolist()),
-        # How many faces have so many corners, and how many inner vertices so many faces.
         "face_sizes": _histogram(cage.face_sizes),
         "valences": _histogram(t.vertex_face_count[_inner_vertices(cage)]),
         "boundary_edge_count": int(cage.is_boundary.sum()),
         "boundary_loop_count": _piece_count(t, np.flatnonzero(cage.is_boundary)),
         "boundary": cage.boundary,
-        # The other rules where they are not the default.
         "rules": {name: rule for name, rule in rules.items() if name != "boundary" and rule != RULES[name][0]},
         "sharp": _sharp_features(cage),
         "attributes": _attributes(cage),
         "patch_count": surface.patches.patch_count,
         "class_count": len(surface.patches.classes),
-        # Of the tessellation: segments per edge, triangles, and memory of the mesh that Mitsuba gets.
         "rate": rate,
         "triangle_count": triangle_count,
         "mesh_bytes": vertex_count * vertex_bytes + triangle_count * TRIANGLE_BYTES,
-        # What will look odd.
         "warnings": list(_warnings(surface)),
     }
 
 
 def in_words(inspected: dict[str, Any]) -> str:
-    """What `inspect` returns, as lines of text."""
+    """Lines of text with the values that `inspect` returns."""
     of = SimpleNamespace(**inspected)
     loops = f"{of.boundary_loop_count:,} loop{'s' * (of.boundary_loop_count != 1)}, rule {of.boundary}"
     boundary = f"{of.boundary_edge_count:,} edges in {loops}"
@@ -101,19 +91,18 @@ def _inner_vertices(cage: ControlCage) -> NDArray[np.bool_]:
 
 
 def _histogram(values: IntArray) -> dict[int, int]:
-    return dict(zip(*(part.tolist() for part in np.unique(values, return_counts=True)), strict=True))
+    return dict(sorted(Counter(values.tolist()).items()))
 
 
 def _listed(counts: dict[int, int], form: str, shown: int = 8) -> str:
-    commonest = sorted(counts, key=lambda value: -counts[value])
-    parts = [form.format(counts[value], value) for value in commonest[:shown]]
-    if len(commonest) > shown:
-        parts.append(f"{len(commonest) - shown} other kinds up to {max(commonest[shown:])}")
+    commonest = Counter(counts).most_common()
+    parts = [form.format(count, value) for value, count in commonest[:shown]]
+    if others := commonest[shown:]:
+        parts.append(f"{len(others)} other kinds up to {max(others)[0]}")
     return ", ".join(parts) or "none"
 
 
 def _piece_count(t: Topology, half_edges: IntArray) -> int:
-    """Number of connected components of some half-edges."""
     ends = t.face_vertices[half_edges], t.face_vertices[t.next[half_edges]]
     graph = sparse.coo_array((np.ones(len(half_edges), dtype=bool), ends), shape=(t.vertex_count, t.vertex_count))
     return len(np.unique(connected_components(graph, directed=False)[1][ends[0]]))
@@ -139,17 +128,15 @@ def _sharp_features(cage: ControlCage) -> dict[str, int]:
 def _attributes(cage: ControlCage) -> dict[str, str]:
     t, described = cage.topology, {}
     for name, attribute in {"texcoords": cage.texcoords, **cage.attributes}.items():
-        if attribute is None:
-            continue
-        described[name] = attribute.interpolation.replace("_", "-")
-        if attribute.indices is not None:
+        if attribute is not None:
+            described[name] = attribute.interpolation.replace("_", "-")
+        if attribute is not None and attribute.indices is not None:
             count = np.count_nonzero(seams(t, attribute.indices)[t.edge_half_edge])
             described[name] += f" with {count:,} seam edges, rule {cage.face_varying}"
     return described
 
 
 def _tessellation_size(surface: LimitSurface, rate: int) -> tuple[int, int]:
-    """Triangles and vertices of a tessellation."""
     sizes = surface.patches.elements.face_sizes
     if surface.scheme.domain.corner_count == 3:
         triangles = len(sizes) * rate**2
@@ -161,11 +148,9 @@ def _tessellation_size(surface: LimitSurface, rate: int) -> tuple[int, int]:
 
 
 def _warnings(surface: LimitSurface) -> Iterator[str]:
-    cage, scheme = surface.cage, surface.scheme
-    t = cage.topology
+    cage, scheme, t = surface.cage, surface.scheme, surface.cage.topology
     inner = _inner_vertices(cage)
-    unused = np.count_nonzero(t.vertex_face_count == 0)
-    if unused:
+    if unused := np.count_nonzero(t.vertex_face_count == 0):
         yield f"{unused:,} vertices belong to no face"
     triangles = np.count_nonzero(cage.face_sizes == 3)
     if scheme.name == "catmull_clark" and triangles > cage.face_count / 2:
@@ -173,26 +158,20 @@ def _warnings(surface: LimitSurface) -> Iterator[str]:
             f"{triangles:,} of {cage.face_count:,} faces are triangles, on which Catmull-Clark ripples; Loop is made "
             'for them, and triangle_rule "smooth" helps'
         )
-    low = np.count_nonzero(inner & (t.vertex_face_count == 2))
-    if low:
+    if low := np.count_nonzero(inner & (t.vertex_face_count == 2)):
         yield f"{low:,} inner vertices have valence 2, where the surface has a normal but does not turn to it smoothly"
-    high = int(t.vertex_face_count[inner].max(initial=0))
-    if high > HIGH_VALENCE:
+    if (high := int(t.vertex_face_count[inner].max(initial=0))) > HIGH_VALENCE:
         yield f"the highest valence is {high}: the surface is pinched around it"
     if scheme.element == "face":
         cut = cage.cut_mesh.topology
         border = cut.is_border_vertex & (cut.vertex_rules == VertexRule.AUTOMATIC)
         # Schemes without rules at borders have no such number, and no cages with borders.
         limit = scheme.regular_border_faces if border.any() else 0
-        crowded = np.count_nonzero(border & (cut.vertex_face_count >= 2 * limit))
-        if crowded:
-            yield (
-                f"{crowded:,} vertices on borders or creases have {2 * limit} or more faces on one side: there is no "
-                "tangent plane there"
-            )
-    ends = t.face_vertices, t.face_vertices[t.next]
-    collapsed = np.count_nonzero((cage.positions[ends[0]] == cage.positions[ends[1]]).all(axis=1))
-    if collapsed:
+        if crowded := np.count_nonzero(border & (cut.vertex_face_count >= 2 * limit)):
+            where = f"{crowded:,} vertices on borders or creases"
+            yield f"{where} have {2 * limit} or more faces on one side: there is no tangent plane there"
+    edges = cage.positions[t.face_vertices] == cage.positions[t.face_vertices[t.next]]
+    if collapsed := np.count_nonzero(edges.all(axis=1)):
         yield f"{collapsed:,} edges of faces have no length: points coincide there, and the normal may be undefined"
     classes = surface.patches.classes
     sharpest = max(patch_class.signature.sharpness for patch_class in classes)

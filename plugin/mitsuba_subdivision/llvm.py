@@ -18,10 +18,8 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, NamedTuple
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from pathlib import Path
+from typing import NamedTuple
 
 ENVIRONMENT_VARIABLE = "DRJIT_LIBLLVM_PATH"
 INSTALL_HINT = (
@@ -33,24 +31,17 @@ NO_USABLE_LLVM = "no LLVM library that Dr.Jit runs without aborting; see mitsuba
 
 _TOO_LATE = "Dr.Jit was imported first"
 _SYSTEM_FOLDERS = (
-    "/usr/local/lib",
-    "/usr/lib/x86_64-linux-gnu",
-    "/usr/lib/aarch64-linux-gnu",
-    "/usr/lib64",
-    "/usr/lib",
-    "/usr/lib/wsl/lib",
-    "/usr/lib/llvm-*/lib",
-    "/opt/llvm*/lib",
+    *("/usr/local/lib", "/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/usr/lib64", "/usr/lib"),
+    *("/usr/lib/wsl/lib", "/usr/lib/llvm-*/lib", "/opt/llvm*/lib"),
 )
 
 
 class LlvmChoice(NamedTuple):
     """The library for Dr.Jit to load."""
 
-    path: str | None  # Path of the library. None if Dr.Jit searches by itself, or if there is no usable library.
-    # Major version of the library, None if unknown. Without a path: of the newest library, which is too old.
-    version: int | None
-    reason: str  # Why this choice was made
+    path: str | None  # None if Dr.Jit searches by itself, or if no library is usable
+    version: int | None  # Major version, None if unknown; without a path, of the newest library, which is too old
+    reason: str
 
 
 def lowest_version() -> int:
@@ -62,16 +53,13 @@ def lowest_version() -> int:
 def select_llvm() -> LlvmChoice:
     """Choose an LLVM library and set ``DRJIT_LIBLLVM_PATH`` to it. Call it before Dr.Jit is imported.
 
-    A setting by the user has precedence. Otherwise the library comes from the extra ``mitsuba-subdivision[llvm]`` or
-    from the Python environment (as with conda), or else is the newest of the system. If all libraries found are too
-    old, LLVM variants are made to fail with an exception instead of ending the process. If none is found, or the system
-    is not Linux, Dr.Jit searches by its own rules.
+    A setting by the user has precedence. Otherwise the library comes from the extra ``mitsuba-subdivision[llvm]``, from
+    the Python environment (as with conda), or else from the system. If all libraries are too old, LLVM variants fail
+    with an exception instead of ending the process. If there is none, or no Linux, Dr.Jit searches by its own rules.
     """
     chosen = os.environ.get(ENVIRONMENT_VARIABLE)
-    if chosen == NO_USABLE_LLVM:
-        # Inherited from a process that found no usable library.
-        chosen = None
-    if chosen:
+    # A process that found no usable library leaves a note to its children.
+    if chosen and chosen != NO_USABLE_LLVM:
         return LlvmChoice(chosen, library_version(chosen), f"{ENVIRONMENT_VARIABLE} is set")
     if "drjit" in sys.modules:
         return LlvmChoice(None, loaded_version(), _TOO_LATE)
@@ -91,9 +79,8 @@ def library_version(path: str | Path) -> int | None:
     resolved = os.path.realpath(path)
     folder = os.path.dirname(resolved)
     for name in (os.path.basename(resolved), os.path.basename(path), folder, os.path.dirname(folder)):
-        match = re.search(r"LLVM-(\d+)|LLVM\.(?:so|dylib)\.(\d+)|llvm(?:-|/)(\d+)", name)
-        if match:
-            return int(next(group for group in match.groups() if group))
+        if match := re.search(r"(?:LLVM-|LLVM\.(?:so|dylib)\.|llvm[-/])(\d+)", name):
+            return int(match[1])
     return None
 
 
@@ -128,8 +115,7 @@ def imported_too_late() -> bool:
 @functools.cache
 def require_llvm() -> None:
     """Raise RuntimeError with `llvm_problem`, if any: with too old a library, the first kernel ends the process."""
-    problem = llvm_problem()
-    if problem:
+    if problem := llvm_problem():
         raise RuntimeError(problem)
 
 
@@ -151,8 +137,7 @@ def version_without_package() -> int | None:
 
 def best_variant() -> str:
     """Fastest variant that needs no GPU: "llvm_ad_rgb", or else "scalar_rgb", with a line on standard error."""
-    problem = llvm_problem()
-    if problem is None:
+    if (problem := llvm_problem()) is None:
         return "llvm_ad_rgb"
     sys.stderr.write(f"mitsuba-subdivision: using the slower variant scalar_rgb. {problem}.\n")
     return "scalar_rgb"
@@ -166,11 +151,10 @@ def _search() -> LlvmChoice:
         ("newest of the system", [*loader_folders, *_SYSTEM_FOLDERS]),
     ):
         versions = [(_known_version(path), path) for path in _libraries(folders)]
-        usable = [(version, path) for version, path in versions if version >= lowest_version()]
-        if usable:
-            version, path = max(usable)
+        version, path = max(versions, default=(0, ""))
+        if version >= lowest_version():
             return LlvmChoice(path, version, reason)
-        newest_old = max([newest_old, *(version for version, _ in versions)])
+        newest_old = max(newest_old, version)
     if newest_old:
         return LlvmChoice(None, newest_old, f"no LLVM {lowest_version()} or newer was found")
     return LlvmChoice(None, None, "no LLVM library was found; Dr.Jit searches by its own rules")
@@ -178,8 +162,7 @@ def _search() -> LlvmChoice:
 
 def _known_version(path: str) -> int:
     """Major version of a library by its name, or else by the library itself; 0 if it is not an LLVM library."""
-    version = library_version(path)
-    if version is not None:
+    if (version := library_version(path)) is not None:
         return version
     try:
         library = ctypes.CDLL(path)
@@ -193,9 +176,8 @@ def _known_version(path: str) -> int:
     return major.value
 
 
-def _libraries(folders: Iterable[str]) -> list[str]:
-    """LLVM libraries in folders, whose names may have stars."""
-    paths = (path for folder in folders for path in glob.glob(f"{folder}/libLLVM[-.]*so*"))
+def _libraries(patterns: Iterable[str]) -> list[str]:
+    paths = (path for folder in patterns for path in glob.glob(f"{folder}/libLLVM[-.]*so*"))
     return [path for path in paths if os.path.isfile(path)]
 
 

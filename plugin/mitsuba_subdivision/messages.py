@@ -14,8 +14,7 @@ from contextlib import contextmanager, suppress
 from typing import TextIO, TypeVar
 
 PROGRAM = "mitsuba-subdivision"
-# Seconds before a line of progress appears.
-PATIENCE = 1.0
+PATIENCE = 1.0  # Seconds before a line of progress appears
 # Errors that wrong input can raise. Any other error is a defect of this package, and keeps its traceback.
 USER_ERRORS = (ValueError, OSError, RuntimeError, MemoryError)
 
@@ -32,7 +31,7 @@ def print_result(text: object) -> None:
 
 def print_error(error: BaseException) -> None:
     """Print an error, without the tracebacks in its text."""
-    _print(f"{PROGRAM}: error: {_text_of(error)}", sys.stderr)
+    print_remark(f"error: {_text_of(error)}")
 
 
 def print_remark(text: str) -> None:
@@ -43,13 +42,9 @@ def print_remark(text: str) -> None:
 @contextmanager
 def printed_warnings(category: type[Warning]) -> Iterator[None]:
     """Print each warning of a category, however often it is issued, and print no warning with a line of code."""
-
-    def show(message: Warning | str, *_place: object, **_more: object) -> None:
-        print_remark(f"warning: {message}")
-
     with warnings.catch_warnings():
         warnings.simplefilter("always", category)
-        warnings.showwarning = show
+        warnings.showwarning = lambda message, *_place, **_more: print_remark(f"warning: {message}")
         yield
 
 
@@ -64,18 +59,15 @@ def flushed_output() -> Iterator[None]:
 
 
 def counted(items: Sequence[T], what: str) -> Iterator[T]:
-    """Iterate over items, and count them; ``what`` they are begins with a capital letter."""
-    if not _is_terminal():
-        return iter(items)
-    # Only here, as it takes some time to import.
-    from tqdm import tqdm
+    """Iterate over items, and count them on a terminal after ``what`` they are."""
+    from tqdm import tqdm  # Only here, as it takes some time to import
 
-    return iter(tqdm(items, desc=what, leave=False, delay=PATIENCE))
+    return iter(tqdm(items, desc=what, leave=False, delay=PATIENCE, disable=not _is_terminal()))
 
 
 @contextmanager
 def timed(what: str) -> Iterator[Callable[[str], None]]:
-    """Show a line for work of few long steps. The function handed out names the current step, after ``what``."""
+    """Show a line for work of few long steps; yield a function that names the current step, after ``what``."""
     if not _is_terminal():
         yield lambda step: None  # noqa: ARG005
         return
@@ -89,10 +81,8 @@ def _text_of(error: BaseException) -> str:
     # Dr.Jit's own message refers to the one of the error that it was raised from.
     while error.__cause__ is not None and "(see above)" in str(error):
         error = error.__cause__
-    if isinstance(error, OSError) and error.strerror and error.filename is not None:
-        return f'"{error.filename}": {error.strerror}'
     if isinstance(error, OSError) and error.strerror:
-        return error.strerror
+        return error.strerror if error.filename is None else f'"{error.filename}": {error.strerror}'
     if isinstance(error, MemoryError):
         return f"there is not enough memory{': ' if str(error) else ''}{error}"
     return _TRACEBACK.sub("", str(error)).strip()

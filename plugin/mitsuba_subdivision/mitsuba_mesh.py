@@ -29,16 +29,13 @@ def mitsuba_mesh(
     # (n, k) each: `vertex_positions`, and if the mesh has them `vertex_normals`, `vertex_texcoords`, and attributes of
     # vertices or faces, `vertex_NAME` or `face_NAME`
     buffers: Mapping[str, NDArray],
-    *,
-    bsdf: mi.BSDF | None = None,
-    emitter: mi.Emitter | None = None,
-    interior: mi.Medium | None = None,
     # Whether vertices get the averages of the normals of their triangles. Without normals, triangles are flat.
     averages_normals: bool = False,
+    **parts: mi.Object | None,  # `bsdf`, `emitter` and `interior`
 ) -> mi.Mesh:
     """Make a mesh of the current variant."""
     properties = mi.Properties()
-    for key, part in (("bsdf", bsdf), ("emitter", emitter), ("interior", interior)):
+    for key, part in parts.items():
         if part is not None:
             properties[key] = part
     mesh = mi.Mesh(
@@ -56,7 +53,7 @@ def mitsuba_mesh(
     for key, values in {"faces": triangles, **buffers}.items():
         stored = values
         if mi.is_spectral and key not in _BUFFERS and values.shape[1] == 3 and "color" in key.lower():
-            # Of colours, Mitsuba's meshes store spectra.
+            # Mitsuba's meshes store spectra in place of colours.
             colors, row = np.unique(values, axis=0, return_inverse=True)
             stored = np.array([mi.srgb_model_fetch(color) for color in colors.tolist()])[row.ravel()]
         parameters[key] = upload(type(parameters[key]), stored)
@@ -72,9 +69,7 @@ class PolygonMesh:
 
     name: str
     triangles: IntArray  # (n_t, 3)
-    # (n_v, k) each: buffers of Mitsuba's mesh by name: `vertex_positions`, and if it has them `vertex_normals`,
-    # `vertex_texcoords` and attributes
-    vertices: dict[str, NDArray]
+    vertices: dict[str, NDArray]  # (n_v, k) each: buffers of `mitsuba_mesh`
 
     suffix: ClassVar = ".ply"
 
@@ -86,7 +81,6 @@ class PolygonMesh:
         return {"type": "ply", "mesh": self, **facets, "bsdf": bsdf, **shining}
 
     def loaded(self, bsdf: mi.BSDF | None, emitter: mi.Emitter | None, interior: mi.Medium | None = None) -> mi.Mesh:
-        """The mesh as an object of Mitsuba."""
         return mitsuba_mesh(self.name, self.triangles, self.vertices, bsdf=bsdf, emitter=emitter, interior=interior)
 
     def save(self, path: Path) -> None:
@@ -138,7 +132,7 @@ class CurveSet:
 
 
 def with_meshes(scene: SceneNode) -> SceneNode:
-    """A scene for ``mi.load_dict``, of which polygon meshes are loaded; those of one material share its BSDF."""
+    """Load the polygon meshes of a scene for ``mi.load_dict``; meshes of one material share its BSDF."""
     bsdfs: dict[str, mi.Object] = {}
     used = set()
 

@@ -6,6 +6,7 @@ import platform
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeAlias
 
@@ -13,48 +14,41 @@ from .llvm import best_variant, llvm_problem, loaded_version, require_llvm
 
 # The module of a variant, such as mitsuba.llvm_ad_rgb. For mypy, a class of a `ModuleType` is no base class.
 Variant: TypeAlias = Any
-# A scene or an entry of one, as `mi.load_dict` takes it.
-SceneNode = dict[str, Any]
+SceneNode = dict[str, Any]  # A scene or an entry of one, as `mi.load_dict` takes it
 # Threads with which Mitsuba reads and writes OpenEXR files: one that waits, and one that works.
 OPENEXR_THREADS = 2
 EXPECTED = 'the module mitsuba with a variant set, a variant such as mitsuba.llvm_ad_rgb, or its name, "llvm_ad_rgb"'
 
 
-def variant_module(
-    mi: ModuleType | str,  # `mitsuba` with a variant set, a variant such as `mitsuba.llvm_ad_rgb`, or its name
-) -> ModuleType:
-    """Where a variant's types and functions are.
-
-    Raises ValueError if it is something else, there is no such variant, or none is set.
-    """
+def variant_module(mi: ModuleType | str) -> ModuleType:
+    """Module of a variant, given as `EXPECTED` says; raises ValueError for anything else and for unknown variants."""
     import mitsuba
 
     name = variant_name(mi)
-    if name not in mitsuba.variants():
-        raise ValueError(_unknown(name))
+    if problem := _unknown(name):
+        raise ValueError(problem)
     return getattr(mitsuba, name)
 
 
-def _unknown(name: str) -> str:
-    import mitsuba
+def _unknown(name: str) -> str | None:
+    from mitsuba import variants
 
-    return f'unknown variant "{name}"; expected one of {", ".join(mitsuba.variants())}'
+    return None if name in variants() else f'unknown variant "{name}"; expected one of {", ".join(variants())}'
 
 
 def variant_problem(name: str) -> str | None:
     """Why a variant cannot run here, None if it can."""
     import drjit as dr
-    import mitsuba
 
-    if name not in mitsuba.variants():
-        return _unknown(name)
+    if problem := _unknown(name):
+        return problem
     if name.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
         return f"variant {name} needs an NVIDIA GPU, and Dr.Jit finds none"
     return llvm_problem() if name.startswith("llvm") else None
 
 
 def chosen_variant(name: str | None) -> str:
-    """A variant that was asked for, or else the best. Raises ValueError, RuntimeError if it cannot run here."""
+    """The variant of this name, or else the best. Raises ValueError, RuntimeError if it cannot run here."""
     if name is None:
         return best_variant()
     if name.startswith("llvm"):
@@ -79,7 +73,7 @@ def set_variant(name: str | None) -> None:
 
 @contextmanager
 def threads_set(count: int | None) -> Iterator[None]:
-    """Compute with so many threads for a while. With one, nothing may be read or written; see `set_variant`."""
+    """Compute with this number of threads for a while. With one, files cannot be read or written: see `set_variant`."""
     import drjit as dr
 
     before = dr.thread_count()
@@ -92,10 +86,7 @@ def threads_set(count: int | None) -> Iterator[None]:
 
 @contextmanager
 def variant_set(mi: ModuleType | str) -> Iterator[ModuleType]:
-    """The module ``mitsuba`` with a variant set, for a while; arguments and errors as of `variant_module`.
-
-    A variant's own module lacks what all variants have in common, such as ``Bitmap``.
-    """
+    """Set a variant for a while, and yield ``mitsuba``; arguments and errors are those of `variant_module`."""
     import mitsuba
 
     variant_module(mi)
@@ -112,7 +103,7 @@ def variant_set(mi: ModuleType | str) -> Iterator[ModuleType]:
 
 
 def variant_name(mi: ModuleType | str) -> str:
-    """Name of a variant, such as "llvm_ad_rgb"; arguments and errors as of `variant_module`, but for unknown names."""
+    """Name of a variant, such as "llvm_ad_rgb"; as `variant_module`, but names are not checked."""
     if isinstance(mi, str):
         return mi
     mitsuba = sys.modules.get("mitsuba")
@@ -138,19 +129,17 @@ def environment(variant: str) -> dict[str, str]:
     import scipy
 
     # Not of this package: its changes are what the tests of renders are for.
-    modules = (mitsuba, drjit, numpy, scipy)
-    versions = {module.__name__: str(module.__version__) for module in modules} | {"processor": _processor()}
+    versions = {module.__name__: str(module.__version__) for module in (mitsuba, drjit, numpy, scipy)}
+    versions["processor"] = _processor()
     if variant.startswith("llvm"):
         versions["llvm"] = str(loaded_version())
     return versions
 
 
 def _processor() -> str:
-    from pathlib import Path
-
     # Code for another processor may add in another order. On Linux, `platform` does not know the model.
-    information = Path("/proc/cpuinfo")
-    name = _first_of(information.read_text(encoding="utf-8", errors="replace")) if information.is_file() else ""
+    listed = Path("/proc/cpuinfo")
+    name = _first_of(listed.read_text(encoding="utf-8", errors="replace")) if listed.is_file() else ""
     return name or platform.processor() or platform.machine()
 
 

@@ -39,10 +39,12 @@ def whole_file(path: str | Path) -> Iterator[Path]:
                 os.fsync(stream.fileno())
             beside.replace(path)
         except (OSError, RuntimeError) as error:
-            renamed = _about(path, beside, error)
-            if renamed is error:
+            if isinstance(error, OSError) and error.errno and str(error.filename or beside) == str(beside):
+                raise type(error)(error.errno, error.strerror, str(path)) from error
+            text = str(error).replace(str(beside), str(path))
+            if text == str(error):
                 raise
-            raise renamed from error
+            raise OSError(text) from error
 
 
 def write_text(path: Path, text: str) -> None:
@@ -51,14 +53,10 @@ def write_text(path: Path, text: str) -> None:
         beside.write_text(text, encoding="utf-8")
 
 
-def require_writable(
-    path: Path,
-    inputs: Iterable[Path] = (),  # Files that the work reads
-) -> None:
+def require_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
     """Check that a file can be written to a path, before its contents are computed; create its folder.
 
-    Raises OSError if ``path`` is a folder, or protected from writing, or the folder cannot be made or written to.
-    Raises ValueError if ``path`` is one of the inputs.
+    Raises ValueError if ``path`` is one of the files that the work reads, OSError if it cannot be written.
     """
     for other in inputs:
         if path.exists() and other.exists() and path.samefile(other):
@@ -78,7 +76,7 @@ def require_writable(
 
 
 def require_folder(folder: Path) -> None:
-    """Create a folder and its parents unless they exist. Raises OSError if that cannot be, as where there is a file."""
+    """Create a folder and its parents unless they exist. Raises OSError if it cannot be made."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
@@ -88,7 +86,7 @@ def require_folder(folder: Path) -> None:
 
 
 def remove_unfinished() -> None:
-    """Remove the unfinished files of this process before it ends."""
+    """Remove the temporary files of this process before it ends."""
     for beside in _unfinished.copy():
         with suppress(OSError):
             beside.unlink(missing_ok=True)
@@ -96,7 +94,6 @@ def remove_unfinished() -> None:
 
 @contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
-    """Path of a file of its own beside another one, which is removed at the end if it is still there."""
     beside = path.with_name(f".{path.stem[:_LONGEST_STEM]}.{uuid.uuid4().hex}.part{path.suffix}")
     _unfinished.add(beside)
     try:
@@ -105,11 +102,3 @@ def _temporary(path: Path) -> Iterator[Path]:
         with suppress(OSError):
             beside.unlink(missing_ok=True)
         _unfinished.discard(beside)
-
-
-def _about(path: Path, beside: Path, error: Exception) -> Exception:
-    """The error, with the user's file name instead of the temporary one."""
-    if isinstance(error, OSError) and error.errno and (error.filename is None or str(error.filename) == str(beside)):
-        return type(error)(error.errno, error.strerror, str(path))
-    text = str(error).replace(str(beside), str(path))
-    return error if text == str(error) else OSError(text)

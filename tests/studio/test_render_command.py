@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.files import formats
 from mitsuba_subdivision.regression.image import load_image
 from mitsuba_subdivision.regression.scene import BOX, load_scene, render_pixels
 from mitsuba_subdivision.shapes import interaction_hook
@@ -157,19 +156,8 @@ def test_frames_are_what_each_file_gives_alone(folder):
 
 
 @scalar
-def test_each_file_is_read_once(folder, monkeypatch):
-    moving_cages(folder)
-    read, evaluated = [], []
-    function_named = formats.function_named
-
-    def function_that_tells(name):
-        return lambda path, *more: read.append(path.name) or function_named(name)(path, *more)
-
-    monkeypatch.setattr(formats, "function_named", function_that_tells)
-    moving = frame_range(folder / "f_%02d.obj", Look(size=(20, 15), spp=1, rate=2, up="z", cage=True), range(1, 4))
-    assert len([*moving.frames([1, 2, 3], None)]) == 3
-    assert read == ["f_01.obj", "f_02.obj", "f_03.obj"]
-    limit_points = Model.limit_points
+def test_limit_points_are_evaluated_once(monkeypatch):
+    evaluated, limit_points = [], Model.limit_points
     monkeypatch.setattr(Model, "limit_points", lambda *given: evaluated.append(1) or limit_points(*given))
     msub.studio_scene(named_cages.cube(), cage=True)
     assert len(evaluated) == 1

@@ -13,8 +13,8 @@ from .. import __version__
 from ..messages import PROGRAM
 from .arguments import CommandParser
 
-# ``module.function`` of this package, and what the program's help says. A module is imported where its command is named
-# only: some take longer to import than others to run.
+# ``module.function`` of this package, and a line of the program's help. A module is imported only if its command is
+# named: some take longer to import than others to run.
 COMMANDS = {
     "figure": ("figure.figure", "draw a figure of the documentation"),
     "render": ("render.render", "render a scene, or a model in a studio"),

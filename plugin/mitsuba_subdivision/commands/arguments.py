@@ -12,14 +12,13 @@ from typing import Any, NoReturn, TypeVar
 from ..schemes import BUILT_IN
 from ..tessellation import HIGHEST_RATE
 
-# Exit status of wrong usage, as argparse has it.
-USAGE_ERROR = 2
+USAGE_ERROR = 2  # Exit status of wrong usage, as argparse has it
 
 V = TypeVar("V")
 
 
 def add_variant(parser: argparse.ArgumentParser, *aliases: str) -> None:
-    """Add the option ``--variant`` to a command, with other names that it may have."""
+    """Add the option ``--variant`` to a command."""
     text = "variant of Mitsuba (default: llvm_ad_rgb where it can run, otherwise scalar_rgb)"
     parser.add_argument(*aliases, "--variant", dest="variant", metavar="VARIANT", help=text)
 
@@ -34,7 +33,7 @@ def add_cage_options(parser: argparse._ActionsContainer, default_rate: str) -> N
 
 
 def checked(kind: Callable[[str], V], is_allowed: Callable[[V], bool], expected: str) -> Callable[[str], V]:
-    """Make the parser of an argument's values, which says what was expected in place of others."""
+    """Make the parser of an argument's values; its errors name the expected ones."""
 
     def parsed(text: str) -> V:
         try:
@@ -52,7 +51,7 @@ finite = checked(float, math.isfinite, "a number")
 above_zero = checked(float, lambda value: 0 < value < math.inf, "a number above 0")
 index = checked(int, lambda value: value >= 0, "an integer, 0 or more")
 positive = checked(int, lambda value: value >= 1, "an integer, 1 or more")
-# Of 32 bits, as Mitsuba has it.
+# Mitsuba's seeds have 32 bits.
 seed = checked(int, lambda value: 0 <= value < 2**32, f"an integer from 0 to {2**32 - 1}")
 rate = checked(int, lambda value: 1 <= value <= HIGHEST_RATE, f"an integer from 1 to {HIGHEST_RATE}")
 

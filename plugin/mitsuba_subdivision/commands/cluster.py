@@ -44,10 +44,7 @@ def cluster(address: str) -> Iterator[Client]:
 
 
 def results(client: Client, work: Callable[[int], T], numbers: Sequence[int]) -> Iterator[tuple[int, T]]:
-    """Numbers and what the workers of a cluster make of them by picklable work, as they finish.
-
-    Where a worker ends early, another one repeats its work.
-    """
+    """Numbers and results of picklable work, as the workers of a cluster finish; work of lost workers is repeated."""
     from distributed import as_completed
 
     # Not pure, in the sense of Dask: a repeated request renders again.
@@ -56,7 +53,6 @@ def results(client: Client, work: Callable[[int], T], numbers: Sequence[int]) ->
 
 
 def _work(work: Callable[[int], T], variant: str, number: int) -> tuple[int, T]:
-    """Runs on a worker."""
     with _lock:
         set_variant(variant)
         return number, work(number)

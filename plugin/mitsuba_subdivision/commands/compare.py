@@ -9,9 +9,13 @@ import shlex
 from pathlib import Path
 
 from ..messages import PROGRAM, print_remark, print_result
-from ..regression import RegressionError
+from ..regression import RegressionError, renders
 from ..regression.compare import MISSING
-from ..regression.tiers import DEFAULT_TIERS, TIERS, Tolerances
+from ..regression.compare import compare as compare_images
+from ..regression.image import load_image, require_finite, save_image
+from ..regression.report import write_report
+from ..regression.scene import BOX, load_scene
+from ..regression.tiers import DEFAULT_TIERS, TIERS, Status, Tolerances
 from ..variants import variant_set
 from ..whole_file import require_folder, require_writable, write_text
 from .arguments import CommandParser, checked, positive, seed, table
@@ -79,13 +83,9 @@ def add_tolerances(group: argparse._ActionsContainer, text: str) -> None:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from ..regression.compare import compare
-    from ..regression.image import load_image
-    from ..regression.report import write_report
-
-    renders = options.test.suffix.lower() == ".xml"
+    is_scene = options.test.suffix.lower() == ".xml"
     given = "--spp" if options.spp else "--seed" if options.seed is not None else None
-    if given and not renders:
+    if given and not is_scene:
         raise RegressionError(f'{given} is for a scene; "{options.test}" is rendered already')
     if not options.reference.is_file():
         making = f"{PROGRAM} render SCENE -o {shlex.quote(str(options.reference))} --reference"
@@ -94,20 +94,18 @@ def _compare(options: argparse.Namespace) -> int:
     stored = Tolerances().with_values(reference.metadata.get("tolerances", {}))
     tolerances = stored.with_values(dict(options.tolerances))
     tiers = options.tiers.split(",") if options.tiers else None
-    test = None if renders else load_image(options.test)
+    test = None if is_scene else load_image(options.test)
     if options.json and options.json != "-":
         require_writable(Path(options.json), [options.reference, options.test])
     if options.html:
         require_folder(options.html)
         require_writable(options.html / "index.html")
     if test is None:
-        from ..regression.renders import TEST_SPP, compare_scene, variant_for
-
-        with variant_set(variant_for(reference)):
-            spp, seed, missing = options.spp or TEST_SPP, options.seed or 0, options.missing_channels
-            comparison = compare_scene(reference, options.test, tiers, spp, tolerances, seed=seed, missing=missing)
+        with variant_set(renders.variant_for(reference)):
+            spp, seed, missing = options.spp or renders.TEST_SPP, options.seed or 0, options.missing_channels
+            comparison = renders.compare_scene(reference, options.test, tiers, spp, tolerances, 1, seed, missing)
     else:
-        comparison = compare(reference, test, tiers, tolerances, missing=options.missing_channels)
+        comparison = compare_images(reference, test, tiers, tolerances, missing=options.missing_channels)
     text = json.dumps(comparison.as_dict(), indent=1)
     if options.json and options.json != "-":
         write_text(Path(options.json), f"{text}\n")
@@ -122,12 +120,6 @@ def _compare(options: argparse.Namespace) -> int:
 
 
 def _accept(options: argparse.Namespace) -> None:
-    from ..regression import renders
-    from ..regression.compare import compare
-    from ..regression.image import load_image, save_image
-    from ..regression.scene import BOX, load_scene
-    from ..regression.tiers import Status
-
     found = sorted(options.reports.rglob("comparison.json"))
     failed = [path.parent for path in found if json.loads(path.read_text())["status"] == "fail"]
     if not failed:
@@ -143,7 +135,7 @@ def _accept(options: argparse.Namespace) -> None:
         with variant_set(seen.metadata["variant"]):
             loaded = load_scene(scene, seen.metadata["parameters"], BOX, seen.metadata["sensor"])
             image = renders.render_pass(loaded, renders.sampling_of(before), with_probe=True)
-        again = compare(image, seen, ["paired", "tile"], tolerances, missing="ignore")
+        again = compare_images(image, seen, ["paired", "tile"], tolerances, missing="ignore")
         if again.status is Status.FAIL or loaded.files != seen.metadata["files"]:
             raise RegressionError(f'"{scene}" has changed since the report "{folder}"; expected its picture\n{again}')
         save_image(path, renders.as_reference(image, scene, path, tolerances))
@@ -151,19 +143,15 @@ def _accept(options: argparse.Namespace) -> None:
 
 
 def _merge(options: argparse.Namespace) -> None:
-    from ..regression.image import load_image, require_finite, save_image
-    from ..regression.renders import merge_passes, missing_passes
-
     if options.output.suffix.lower() != ".exr":
         raise RegressionError(f'output "{options.output}"; expected a name ending in .exr')
     passes = [load_image(path) for path in options.passes]
     for image in passes:
         require_finite(image)
-    merged = merge_passes(passes, str(options.output))
+    merged = renders.merge_passes(passes, str(options.output))
     require_writable(options.output, options.passes)
     save_image(options.output, merged)
-    missing = missing_passes(merged)
-    if missing:
+    if missing := renders.missing_passes(merged):
         count = merged.metadata["sampling"].get("passes", 1)
         print_remark(f"warning: of {count} passes, these are missing: {', '.join(map(str, missing))}")
     print_result(options.output)

@@ -15,8 +15,7 @@ from .arguments import CommandParser, add_variant, checked, positive, table
 
 # Ignored by git: pictures of the pages lie beside it, in renders/figures, and another processor draws other last bits.
 DRAWN = Path("renders/drawn")
-# In millimetres, of posters.
-WIDEST = 1200.0
+WIDEST = 1200.0  # Millimetres, for posters
 
 
 def figure(parser: CommandParser) -> None:

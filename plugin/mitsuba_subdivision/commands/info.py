@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 from ..cage import ControlCage
+from ..files.formats import FORMATS, require_triangle_format
 from ..messages import print_result
 from ..surface import LimitSurface
 from ..whole_file import require_writable
@@ -28,7 +29,8 @@ def tessellate(parser: CommandParser) -> None:
     """Add the options of ``tessellate``."""
     parser.description = "Write triangles on the limit surface of a control cage, with exact points and normals."
     _add_cage(parser)
-    text = ".obj, .ply, .usd, .usda or .usdc file to write"
+    *others, last = (suffix for suffix, known in FORMATS.items() if known.write_triangles)
+    text = f"{', '.join(others)} or {last} file to write"
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=text)
     parser.set_defaults(run=_tessellate)
 
@@ -64,8 +66,6 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def _tessellate(options: argparse.Namespace) -> None:
-    from ..files.formats import require_triangle_format
-
     require_triangle_format(options.output)
     surface = _surface(options)
     require_writable(options.output, [options.cage])

@@ -25,7 +25,8 @@ from ..cage.errors import CageWarning, warn
 from ..files import require_usd
 from ..files.formats import FORMATS
 from ..messages import counted, print_remark, print_result
-from ..regression.image import METADATA_ATTRIBUTE
+from ..regression import renders
+from ..regression.image import METADATA_ATTRIBUTE, save_image
 from ..regression.scene import BOX, LoadedScene, kept_search_folders, load_scene, render_image
 from ..regression.tiers import Tolerances
 from ..shapes.parameter_table import SHADINGS
@@ -38,11 +39,10 @@ from ..studio.studio_entries import LENGTHS, UP_AXES, VIEWS, Environment
 from ..variants import set_variant, threads_set, variant_problem
 from ..whole_file import require_writable, whole_file
 from .arguments import CommandParser, above_zero, add_cage_options, add_variant, checked, finite, index, positive, seed
+from .cluster import cluster, render_on_cluster, results
 from .compare import TOLERANCES, add_tolerances
 
-IMAGE_SUFFIXES = (".exr", ".png", ".jpg", ".hdr")
-VIDEO_SUFFIXES = (".gif", ".mp4")
-SCENE_SUFFIX = ".xml"
+IMAGE_SUFFIXES, VIDEO_SUFFIXES, SCENE_SUFFIX = (".exr", ".png", ".jpg", ".hdr"), (".gif", ".mp4"), ".xml"
 DEFAULT_FPS = 24
 # Options about models, by the names that they have after parsing; others are about every scene.
 _OF_MODELS = (
@@ -53,17 +53,14 @@ _OF_FRAMES = ("turntable", "frames", "shutter", "fps")
 # Options that select one mesh of a USD file, and those of whole ones.
 _OF_ONE_MESH = ("up", "scheme", "prim", "checker", "cage")
 _OF_STAGES = ("shutter", "texture_size", "camera", "over")
-# Options that do not apply to a model's scene.
-_OF_SCENES = ("parameters", "sensor", "share", "reference", "tolerances")
+_OF_SCENES = ("parameters", "sensor", "share", "reference", "tolerances")  # Options about scenes in files
 # Options that `Look` has by the same names.
 _OF_LOOK = ("up", "size", "spp", "rate", "checker", "cage", "texture_size", "environment", "transparent", "aovs")
-# Suffixes of files that Blender reads, and writes as USD files.
+# Suffixes of files that Blender converts to USD files.
 _OF_BLENDER = (".blend", ".fbx", ".gltf", ".glb", ".abc", ".dae", ".stl", ".3ds")
-# Sub-frames of an interval.
-SUB_FRAMES = 16
+SUB_FRAMES = 16  # In an interval
 _WITH_ALPHA = (".exr", ".png")
-# Sides of the pictures in an MP4 file are multiples of this; others lose a row or a column.
-EVEN = 2
+EVEN = 2  # Sides of the pictures in an MP4 file are multiples of this; others lose a row or a column
 
 
 class Picture(NamedTuple):
@@ -74,32 +71,20 @@ class Picture(NamedTuple):
     products: dict[str, list[str]]  # Names of AOVs of products, by their names; "" is the colour
 
 
-class Shutter(NamedTuple):
-    """Number of sub-frames, and when it opens and closes, in time codes after the time; None for as the camera says."""
-
-    sub_frames: int
-    interval: tuple[float, float] | None = None
-
-
-def _sides(text: str) -> tuple[int, int]:
-    width, height = map(int, text.split("x"))
-    return width, height
-
-
 def _numbers(text: str) -> range:
     first, last, *step = map(int, text.split(":"))
     return range(first, last + 1, *step)
 
 
-def _one_of_many(text: str) -> tuple[int, int]:
-    number, count = map(int, text.split("/"))
-    return number, count
+def _integers(separator: str) -> Callable[[str], tuple[int, ...]]:
+    return lambda text: tuple(map(int, text.split(separator)))
 
 
-def _shutter_of(text: str) -> Shutter:
+def _shutter_of(text: str) -> tuple[int, tuple[float, float] | None]:
+    """Number of sub-frames, and time codes from the frame to opening and closing; None for those of the camera."""
     numbers = text.split(":")
     count = int(numbers[0] if len(numbers) == 1 else numbers[2] if len(numbers) == 3 else SUB_FRAMES)
-    return Shutter(count, None if len(numbers) == 1 else (float(numbers[0]), float(numbers[1])))
+    return count, None if len(numbers) == 1 else (float(numbers[0]), float(numbers[1]))
 
 
 def _environment_of(text: str) -> Environment:
@@ -109,9 +94,7 @@ def _environment_of(text: str) -> Environment:
 
 _shutter = checked(
     _shutter_of,
-    lambda shutter: (
-        shutter.sub_frames > 0 and (shutter.interval is None or -inf < shutter.interval[0] < shutter.interval[1] < inf)
-    ),
+    lambda shutter: shutter[0] > 0 and (shutter[1] is None or -inf < shutter[1][0] < shutter[1][1] < inf),
     "a number of sub-frames, or OPEN:CLOSE or OPEN:CLOSE:N, such as -0.25:0.25",
 )
 _environment = checked(
@@ -124,9 +107,13 @@ _aovs = checked(
     lambda aovs: None not in aovs.values(),
     f"some of {', '.join(AOVS)}, such as normals,depth",
 )
-_size = checked(_sides, lambda size: min(size) > 0, "width and height of 1 or more, such as 1280x720")
+_size = checked(
+    _integers("x"), lambda size: len(size) == 2 and min(size) > 0, "width and height of 1 or more, such as 1280x720"
+)
 _frame_range = checked(_numbers, lambda numbers: len(numbers) > 0, "FIRST:LAST or FIRST:LAST:STEP, such as 1:24")
-_share = checked(_one_of_many, lambda share: 1 <= share[0] <= share[1], "I/N with I from 1 to N, such as 2/8")
+_share = checked(
+    _integers("/"), lambda share: len(share) == 2 and 1 <= share[0] <= share[1], "I/N with I from 1 to N, such as 2/8"
+)
 _assignment = checked(lambda text: text.split("=", 1), lambda pair: len(pair) == 2 and pair[0] != "", "NAME=VALUE")
 
 
@@ -210,10 +197,9 @@ def _render(options: argparse.Namespace) -> None:
     suffix = options.scene.suffix.lower()
     is_model = suffix in FORMATS
     if suffix in _OF_BLENDER:
-        raise ValueError(
-            f'"{options.scene}" is a file for programs such as Blender, which write it as USD file; expected a model '
-            f'({", ".join(FORMATS)}): see the page "From Blender to a picture" of the guide, blender.md'
-        )
+        page = 'see the page "From Blender to a picture" of the guide, blender.md'
+        what = f'"{options.scene}" is a file for programs such as Blender, which write it as USD file'
+        raise ValueError(f"{what}; expected a model ({', '.join(FORMATS)}): {page}")
     if not is_model and suffix != SCENE_SUFFIX and not options.scene.is_file():
         expected = f"a Mitsuba scene ({SCENE_SUFFIX}) or a model ({', '.join(FORMATS)})"
         raise ValueError(f'"{options.scene}" is not a file; expected {expected}')
@@ -257,12 +243,12 @@ def _stated_variant(options: argparse.Namespace) -> str | None:
 
 def _is_stage(options: argparse.Namespace) -> bool:
     """Whether a USD file is rendered as a whole."""
-    is_usd = options.scene.suffix.lower().startswith(".usd")
+    file_format = FORMATS.get(options.scene.suffix.lower())
+    is_usd = file_format is not None and file_format.has_prims
     return is_usd and not any(getattr(options, name) for name in _OF_ONE_MESH)
 
 
 def _require_effect(options: argparse.Namespace, is_model: bool) -> None:
-    """Refuse options that have no effect with this input."""
     what, useless = ("model", _OF_SCENES) if is_model else ("scene", (*_OF_MODELS, *_OF_FRAMES, "save_scene"))
     other = "a Mitsuba scene, which --save-scene writes" if is_model else "a model"
     for name in useless:
@@ -299,9 +285,7 @@ def _refuse_contradictions(options: argparse.Namespace, by_passes: bool) -> None
     if options.transparent and by_passes:
         raise ValueError(f"--transparent is for pictures; expected no {all_options} beside it")
     if options.transparent and suffix not in _WITH_ALPHA:
-        raise ValueError(
-            f'output "{options.output}" has no alpha; expected a name ending in {" or ".join(_WITH_ALPHA)}'
-        )
+        raise ValueError(f'output "{options.output}" has no alpha; expected one ending in {" or ".join(_WITH_ALPHA)}')
     if options.environment and not options.environment.path.is_file():
         raise FileNotFoundError(f'"{options.environment.path}": there is no such file; expected a picture')
     known = (*IMAGE_SUFFIXES, *(VIDEO_SUFFIXES if has_frames else ()))
@@ -325,7 +309,6 @@ def _refuse_contradictions(options: argparse.Namespace, by_passes: bool) -> None
 
 @contextmanager
 def _settings(options: argparse.Namespace) -> Iterator[None]:
-    """Set search folders and log level by the options, and restore them afterwards."""
     level = mi.log_level()
     with kept_search_folders() as resolver:
         for folder in filter(None, ";".join(options.append).split(";")):
@@ -350,7 +333,6 @@ def _picture_of_scene(options: argparse.Namespace) -> Picture:
 
 
 def _write_frames(options: argparse.Namespace) -> None:
-    """Render the missing frames, and join all to a video if requested."""
     is_video = options.output.suffix.lower() in VIDEO_SUFFIXES
     if is_video:
         _require_encoder(options.output)
@@ -390,10 +372,6 @@ def _write_image(options: argparse.Namespace, picture: Picture, path: Path) -> N
         print_result(file)
 
 
-def _sub_frames(options: argparse.Namespace) -> int:
-    return options.shutter.sub_frames if options.shutter else 1
-
-
 def _bitmap(image: NDArray[np.float32], channels: list[str], *, in_8_bits: bool) -> mi.Bitmap:
     if not in_8_bits and any("." in name for name in channels):
         return mi.Bitmap(image, mi.Bitmap.PixelFormat.MultiChannel, channels)
@@ -407,8 +385,8 @@ def _bitmap(image: NDArray[np.float32], channels: list[str], *, in_8_bits: bool)
 def _render_picture(
     options: argparse.Namespace, scenes: Iterable[LoadedScene], spp: int | None = None, source: Any = None
 ) -> Picture:
-    """Render a scene of a source, or the mean of the scenes of a frame's sub-frames, which share no samples."""
-    count = _sub_frames(options)
+    """Mean picture of scenes that share no samples: one, or those of a frame's sub-frames."""
+    count, _ = options.shutter or (1, None)
     total: Any = 0.0
     for part, loaded in enumerate(scenes):
         seed = (options.seed * count + part) % 2**32
@@ -435,16 +413,12 @@ def _pictures(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[t
     shown, source = _shown(options)
     if options.save_scene:
         save_scene(shown.scene, options.save_scene, [options.scene])
-    scenes = shown.frames(numbers, options.filter)
-    count = _sub_frames(options)
-    return ((number, _render_picture(options, islice(scenes, count), source=source)) for number in numbers)
+    scenes, (sub_frames, _) = shown.frames(numbers, options.filter), options.shutter or (1, None)
+    return ((number, _render_picture(options, islice(scenes, sub_frames), source=source)) for number in numbers)
 
 
 def _render_by_passes(options: argparse.Namespace, is_model: bool) -> None:
     """Render by passes, in the current variant, here or on a cluster, and write the image."""
-    from ..regression import renders
-    from ..regression.image import save_image
-
     # Workers get it, too, and may be in another folder.
     load: Callable[[], LoadedScene] = partial(_load_still, _as_data(options))
     if not is_model:
@@ -464,8 +438,6 @@ def _render_by_passes(options: argparse.Namespace, is_model: bool) -> None:
     settings = {"with_probe": options.reference}
     with threads_set(options.threads):
         if options.dask:
-            from .cluster import render_on_cluster
-
             image = render_on_cluster(options.dask, load, sampling, options.passes or 0, **settings)
         elif options.share:
             image = renders.render_pass(loaded, sampling, number, count, **settings)
@@ -485,14 +457,11 @@ def _as_data(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _load_still(given: dict[str, Any]) -> LoadedScene:
-    """The scene of a model's picture, by options `_as_data`."""
     options = argparse.Namespace(**given)
     return next(_shown(options)[0].frames([1], options.filter))
 
 
 def _on_cluster(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
-    from .cluster import cluster, results
-
     # The command's own number: files may change until the next one.
     command = pickle.dumps(_as_data(options) | {"command": uuid4().hex})
     warned: set[str] = set()
@@ -527,13 +496,10 @@ def _shown(options: argparse.Namespace) -> tuple[FrameRange | Turntable | StillP
     shown: FrameRange | Turntable | StillPicture
     if options.frames or options.shutter:
         shown = FrameRange(source, options.frames or range(1, 2))
+    elif options.turntable:
+        shown = Turntable(source, options.turntable, follows_sensor=not options.save_scene)
     else:
-        follows_sensor = not options.save_scene
-        shown = (
-            Turntable(source, options.turntable, follows_sensor=follows_sensor)
-            if options.turntable
-            else (StillPicture(source, follows_sensor=follows_sensor))
-        )
+        shown = StillPicture(source, follows_sensor=not options.save_scene)
     for remark in source.remarks():
         print_remark(remark)
     if options.save_scene and source.factor != 1:
@@ -542,7 +508,6 @@ def _shown(options: argparse.Namespace) -> tuple[FrameRange | Turntable | StillP
 
 
 def _source(options: argparse.Namespace) -> Any:
-    """Scene source of one mesh, or of a whole USD file."""
     azimuth, elevation = VIEWS[options.view or DEFAULT_VIEW]
     azimuth = azimuth if options.azimuth is None else options.azimuth
     elevation = elevation if options.elevation is None else options.elevation
@@ -577,14 +542,12 @@ def _require_encoder(path: Path) -> None:
         if path.suffix.lower() == ".mp4":
             import imageio_ffmpeg  # noqa: F401
     except ImportError as error:
-        raise ValueError(
-            f'output "{path}": the package {error.name}, which writes videos, is missing; pip install '
-            '"mitsuba-subdivision[video]", or name a .png file for frames only'
-        ) from None
+        what = f'output "{path}": the package {error.name}, which writes videos, is missing'
+        instead = 'pip install "mitsuba-subdivision[video]", or name a .png file for frames only'
+        raise ValueError(f"{what}; {instead}") from None
 
 
 def _write_video(path: Path, frames: Sequence[Path], fps: float) -> None:
-    """Write PNG files of one size as a video, an animated GIF that repeats or an MP4 file."""
     import imageio.v2 as imageio
 
     # A GIF file repeats for ever, and its durations are milliseconds.

@@ -20,23 +20,19 @@ __all__ = ["FIGURES", "Figure", "FigureError", "FigureOptions", "require_options
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure; call it with `FigureOptions` to draw it, and get the files written.
-
-    A call raises FigureError if matplotlib is not installed; the message names the extra that brings it.
-    """
+    """A figure; call it with `FigureOptions` to draw it, and get the files written."""
 
     name: str
-    module: str  # Of this package, with the function ``draw_NAME``. It imports Mitsuba, so it is imported only then.
-    shows: str  # What the figure shows, for the help
-    # Those of "spp", "scheme" and "cage" that change the figure; "resolution" and "width" change all
-    options: tuple[str, ...] = ()
-    width: float = PAGE  # Width on paper in millimetres, unless the options have another
-    spp: int = FigureOptions.spp  # Samples per pixel, likewise
-    has_numbers: bool = False  # Whether they are written as CSV
+    module: str  # Has the function ``draw_NAME``, and imports Mitsuba: it is imported when the figure is drawn
+    shows: str  # For the help
+    options: tuple[str, ...] = ()  # Names of options that change the figure, besides "resolution" and "width"
+    width: float = PAGE  # Default of the option
+    spp: int = FigureOptions.spp  # Default of the option
+    has_numbers: bool = False  # Whether the figure writes CSV
 
     @property
     def formats(self) -> tuple[str, ...]:
-        """Of "png", "pdf", "exr" for figures that are rendered, and "csv" for those that plot numbers."""
+        """Formats of the figure's files: "exr" of renders, "csv" of plotted numbers."""
         left_out = {"exr": "spp" not in self.options, "csv": not self.has_numbers}
         return tuple(name for name in FigureOptions.formats if not left_out.get(name))
 
@@ -75,7 +71,7 @@ FIGURES = {figure.name: figure for figure in _FIGURES}
 
 
 def require_options(name: str, given: dict[str, object], formats: Iterable[str]) -> None:
-    """Raise ValueError for options, by name, that do not change a figure, and formats that it does not have."""
+    """Raise ValueError for options that have no effect on a figure, and formats that it does not have."""
     figure = FIGURES[name]
     for option in given:
         if option not in (*figure.options, "resolution", "width"):

@@ -23,8 +23,7 @@ from . import staging
 from .output import FigureError, FigureOptions, panels, rows_of, show, write_figure
 
 LEVELS = 4
-# Of the ball that fills the picture, for cages of users.
-RADIUS = 1.9
+RADIUS = 1.9  # The ball that fills the picture, for cages of users
 REGULAR, IRREGULAR = (0.9, 0.9, 0.89), (0.22, 0.24, 0.27)
 # Segments of an edge of level 0, whose ends are tested for visibility; an edge of the next level has half as many.
 EDGE_SEGMENTS = 24
@@ -42,8 +41,7 @@ def draw_subdivision(options: FigureOptions) -> list[Path]:
         cages.append(cages[-1].refined())
     counts = {extraordinary_count(cage.topology) for cage in cages}
     if len(counts) != 1:
-        numbers = f"{sorted(counts)} extraordinary points at levels 0 to {LEVELS - 1}"
-        raise FigureError(f"{numbers}; expected as many at each")
+        raise FigureError(f"{sorted(counts)} extraordinary points at several levels; expected as many at each")
     # Title and caption of each panel, its scene, and lines of some width and points on the surface there.
     drawn = []
     for level, cage in enumerate(cages):
@@ -126,12 +124,8 @@ def _centres(cage: ControlCage) -> NDArray[np.float64]:
     return np.add.reduceat(cage.positions[t.face_vertices], t.face_offsets[:-1]) / t.face_sizes[:, None]
 
 
-def edge_curves(
-    surface: LimitSurface,
-    half_edges: NDArray[np.integer],  # (n,): of `patches.elements`; curves begin at their first ends
-    segments: int,
-) -> NDArray[np.floating]:
-    """Points ``(n, segments + 1, 3)`` along edges on the limit surface, or halves of edges."""
+def edge_curves(surface: LimitSurface, half_edges: NDArray[np.integer], segments: int) -> NDArray[np.floating]:
+    """Points ``(n, segments + 1, 3)`` on the limit surface along half-edges ``(n,)`` of its `patches.elements`."""
     elements = surface.patches.elements
     along = np.stack([np.linspace(0, 1, segments + 1), np.zeros(segments + 1)], axis=1)
     element = elements.face[half_edges]
@@ -151,10 +145,8 @@ TITLES = {
     "infinite": "infinitely sharp\nevery crease",
 }
 CAGE_TITLE = "control cage"
-# Height of the pictures, in widths.
-HEIGHT = 1.55
-CREASE_RATE = 24
-INFINITE = 10
+HEIGHT = 1.55  # Widths of a picture
+CREASE_RATE, INFINITE = 24, 10
 LACQUER = {"roughness": 0.3, "specular": 0.5, "clearcoat": 0.6, "clearcoat_gloss": 0.95}
 MATERIAL = {"type": "principled", "base_color": {"type": "rgb", "value": [0.55, 0.30, 0.13]}, **LACQUER}
 # Colour of the cage's faces in sRGB; colour and radius of its edges, from this sharpness on. The cage is 2.7 high.
@@ -191,29 +183,27 @@ def _tagged(cage: ControlCage, name: str) -> ControlCage:
 def _cage_shapes(cage: ControlCage) -> SceneNode:
     """Shapes of the cage: flat faces, and edges as rods, which are thick and coloured where they are creases."""
     # Each triangle has three vertices of its own, so that no normals are averaged.
-    positions = cage.positions[cage.triangles.ravel()]
-    triangles = np.arange(len(positions)).reshape(-1, 3)
-    shapes: SceneNode = {"faces": staging.make_mesh(positions, triangles, staging.paint(PALE))}
+    corners = cage.positions[cage.triangles.ravel()]
+    mesh = staging.make_mesh(corners, np.arange(len(corners)).reshape(-1, 3), staging.paint(PALE))
     t, half_edges = cage.topology, cage.topology.edge_half_edge
     ends = t.face_vertices[np.stack([half_edges, t.next[half_edges]], axis=1)]
     sharpness = cage.tags.edges[half_edges]
     looks = [EDGES[max(least for least in EDGES if least <= value)] for value in sharpness]
-    return shapes | staging.edge_rods(cage, ends, sharpness, looks)
+    return {"faces": mesh, **staging.edge_rods(cage, ends, sharpness, looks)}
 
 
 def labels(sharpness: NDArray[np.floating]) -> dict[int, str]:
     """Ranges of the sharpness of creases by their least values in `EDGES`."""
     ranges = {}
     for least, end in itertools.pairwise([*EDGES, np.inf]):
-        values = np.unique(sharpness[(sharpness >= least) & (sharpness < end) & (sharpness > 0)])
+        values = sharpness[(sharpness >= least) & (sharpness < end) & (sharpness > 0)]
         if len(values):
-            ends_of_range = dict.fromkeys(f"{value:g}" for value in values[[0, -1]])
-            ranges[int(least)] = "∞" if least == INFINITE else "\u2013".join(ends_of_range)
+            ends = dict.fromkeys(f"{value:g}" for value in (values.min(), values.max()))
+            ranges[int(least)] = "∞" if least == INFINITE else "\u2013".join(ends)
     return ranges
 
 
 def _draw_legend(axis: Axes, cage: ControlCage) -> None:
-    """Draw the colours of sharpness below the cage."""
     shown = labels(cage.tags.edges)
     # Squares, as a line before a number reads as a minus sign.
     square = partial(Line2D, [], [], linestyle="none", marker="s", markersize=4)
@@ -221,5 +211,4 @@ def _draw_legend(axis: Axes, cage: ControlCage) -> None:
     handles.insert(0, Line2D([], [], linestyle="none", label="sharpness"))
     spaces = {"handlelength": 0.9, "handletextpad": 0.3, "columnspacing": 0.9, "borderaxespad": 0.1}
     legend = axis.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0), ncols=len(handles), **spaces)
-    # Captions of other panels reserve the room for it.
-    legend.set_in_layout(False)
+    legend.set_in_layout(False)  # Captions of other panels reserve the room for it

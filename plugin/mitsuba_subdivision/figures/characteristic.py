@@ -27,8 +27,7 @@ from ..surface import LimitSurface
 from .output import SERIES, FigureOptions, hide_frame, label_powers, panels, write_figure
 from .staging import around_vertices, frame, grid_points
 
-# Points along each side of a polygon, which the map bends.
-SIDE_POINTS = 24
+SIDE_POINTS = 24  # Each side of a polygon, which the map bends
 VALENCE, LEVELS = 5, 6
 # Size of labels at level 0 in points, per millimetre of the figure's width; those of other levels are smaller, as
 # their domains are. Indices are 0.7 times as large as labels, and 6 points at least.
@@ -36,30 +35,23 @@ LABEL_SIZE, LEAST_LABEL = 0.175, 8.6
 # The irregular child is grey, as in the figure `subdivision`; in grey prints, all four differ.
 CHILD_COLOURS = ("#747b84", "#fcebbc", "#e39360", "#b3d3e0")
 CONTROL_EDGE, NEW_EDGE = "#8d97a1", "#3f5b6b"
-# Stencils that agree to this many decimals are the same: their entries are fractions of small integers.
-DECIMALS = 9
-# Of the tree: faces around the corners of the face, two of which are extraordinary.
-VALENCES = (3, 4, 5, 4)
+DECIMALS = 9  # Stencils that agree so far are the same: their entries are fractions of small integers
+VALENCES = (3, 4, 5, 4)  # Faces around the corners of the tree's face; two corners are extraordinary
 # Regular leaves, and those of each level around an extraordinary vertex; what is below is grey.
 LEAF_COLOURS, REST = ("#fcfcd0", "#b9dfa8", "#63b7b3", "#2a7fb0"), "#8d97a1"
-# Of the springs along the face's edges that hold its corners, against those of other edges.
-SLACK = 0.15
+SLACK = 0.15  # Stiffness of springs along the edges of the tree's face, relative to other edges
 LINE = "#2d3a45"
 
 
 def patch_of_valence(scheme: Scheme, valence: int) -> IrregularPatch:
     """The patch with one extraordinary point, at its parameters (0, 0), and regular faces and vertices around it."""
-    patch = irregular_patch(scheme, isolated_signature(scheme, valence))
-    if patch is None:
+    if (patch := irregular_patch(scheme, isolated_signature(scheme, valence))) is None:
         raise ValueError(f"valence {valence} is regular; expected an extraordinary one")
     return patch
 
 
 def characteristic_points(patch: IrregularPatch, valence: int) -> FloatArray:
-    """Control points ``(K, 2)`` of the characteristic map, from a patch's parameters to the plane.
-
-    Of all bases of the subdominant eigenvectors, that in which edges at the point (0, 0) are a regular star, from x on.
-    """
+    """Control points ``(K, 2)`` of the characteristic map whose edges at (0, 0) are a regular star, from x on."""
     points, turn = patch.basis.vectors[:, 1:3], 2 * np.pi / valence
     begin, end = on_patch(patch.scheme, patch.signature, points, patch.scheme.domain.corners[[1, -1]])
     star = np.array([(1, 0), (np.cos(turn), np.sin(turn))]).T
@@ -73,23 +65,22 @@ def on_patch(scheme: Scheme, signature: Signature, points: FloatArray, uv: Float
 
 def sector(points: FloatArray, index: int, valence: int) -> FloatArray:
     """Rotate points of the first patch around an extraordinary point at (0, 0) into the ``index``-th one."""
-    angle = index * 2 * np.pi / valence
-    cos, sin = np.cos(angle), np.sin(angle)
-    return points @ np.array([(cos, sin), (-sin, cos)])
+    turned = points @ (1, 1j) * np.exp(2j * np.pi * index / valence)
+    return np.stack([turned.real, turned.imag], axis=1)
 
 
 def outline(corners: NDArray[np.floating]) -> NDArray[np.float64]:
     """Points along the sides of a polygon ``(m, 2)``, `SIDE_POINTS` on each."""
-    t = np.linspace(0, 1, SIDE_POINTS, endpoint=False)[None, :, None]
-    return ((1 - t) * corners[:, None] + t * np.roll(corners, -1, axis=0)[:, None]).reshape(-1, 2)
+    sides = np.linspace(corners, np.roll(corners, -1, axis=0), SIDE_POINTS, endpoint=False, axis=1)
+    return sides.reshape(-1, 2)
 
 
 def sub_domain(domain: ParameterDomain, level: int, child: int) -> NDArray[np.float64]:
     """Corners ``(m, 2)`` of the parameters of child ``child`` of the ``level``-th refinement at (0, 0)."""
-    corners = domain.children[child].inverse()(domain.corners)
+    outward = domain.children[child].inverse()
     for _ in range(level):
-        corners = domain.children[0].inverse()(corners)
-    return np.asarray(corners, dtype=np.float64)
+        outward = domain.children[0].inverse() @ outward
+    return np.asarray(outward(domain.corners), dtype=np.float64)
 
 
 def draw_domains(options: FigureOptions) -> list[Path]:
@@ -133,10 +124,7 @@ def draw_domains(options: FigureOptions) -> list[Path]:
 
 
 def refinement_step(patch: IrregularPatch, valence: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Control points ``(K, 2)`` of a patch and ``(M, 2)`` of its children, and the ends of edges between either.
-
-    They lie where the patch's characteristic map puts them.
-    """
+    """Control points ``(K, 2)`` of the characteristic map and ``(M, 2)`` of its children, and ends of their edges."""
     old = characteristic_points(patch, valence)
     stencils = np.unique(np.concatenate([patch.matrix, *patch.children]).round(DECIMALS), axis=0)
     ring = one_ring(patch.signature).topology
@@ -180,7 +168,7 @@ def draw_tree(options: FigureOptions) -> list[Path]:
     scheme = scheme_named("catmull_clark")
     signature = Signature("face", tuple(Fan((4,) * valence) for valence in VALENCES))
     tree, form, ring = patch_tree(scheme, signature), polynomial_basis(scheme), one_ring(signature)
-    # From the parameters of each leaf to those of the face; the level, 0 for regular leaves; rows of weights.
+    # Map from the parameters of each leaf to those of the face; level, 0 for regular leaves; rows of weights
     leaves: list[tuple[ParameterMap, int, FloatArray]] = [
         (ParameterMap(*domain), 0, rows)
         for *domain, rows in zip(*tree.regular_domains, tree.coefficients(form.of_controls), strict=True)
@@ -206,11 +194,8 @@ def draw_tree(options: FigureOptions) -> list[Path]:
         face.fill(*corners.T, facecolor=colour, edgecolor=LINE, linewidth=0.4, zorder=2)
     face.plot(*image(np.stack([rest.offset for rest in rests])).T, "o", color="#c8432b", markersize=4, zorder=5)
     hide_frame(face)
-    face.set(
-        title="a face and its one-ring,\nleaves of its patch tree",
-        xlabel=f"$K$ = {count} control points\ngrey: (10) and (12); red: (13)",
-    )
-
+    colours = f"$K$ = {count} control points\ngrey: (10) and (12); red: (13)"
+    face.set(title="a face and its one-ring,\nleaves of its patch tree", xlabel=colours)
     weights = np.concatenate([rows for *_, rows in leaves])
     # Small weights are seen, too.
     matrix.imshow(weights, aspect="auto", cmap="Greys", norm=PowerNorm(0.5, 0, 1), interpolation="nearest")
@@ -218,12 +203,8 @@ def draw_tree(options: FigureOptions) -> list[Path]:
         strip = {"xmin": -0.06, "xmax": -0.01, "clip_on": False, "linewidth": 0.2, "edgecolor": LINE}
         matrix.axhspan(size * number - 0.5, size * (number + 1) - 0.5, facecolor=LEAF_COLOURS[level], **strip)
         matrix.axhline(size * number - 0.5, color=LINE, linewidth=0.2)
-    matrix.set(
-        xticks=[],
-        yticks=[],
-        title="coefficients of all leaves =\nmatrix × control points",
-        xlabel=f"$K$ = {count} control points\n{len(leaves)} leaves, {size} coefficients each",
-    )
+    counts = f"$K$ = {count} control points\n{len(leaves)} leaves, {size} coefficients each"
+    matrix.set(xticks=[], yticks=[], title="coefficients of all leaves =\nmatrix × control points", xlabel=counts)
     return write_figure(options, "tree", figure, cage="none")
 
 
@@ -233,8 +214,7 @@ def _in_the_plane(topology: Topology) -> FloatArray:
     laplacian = np.zeros((t.vertex_count, t.vertex_count))
     start, end = t.face_vertices, t.face_vertices[t.next]
     laplacian[start, end] = laplacian[end, start] = -1
-    # The face is drawn large.
-    corners = t.face_vertices[: t.face_sizes[0]]
+    corners = t.face_vertices[: t.face_sizes[0]]  # The face is drawn large
     laplacian[np.ix_(corners, corners)] *= SLACK
     np.fill_diagonal(laplacian, -laplacian.sum(axis=1))
     # Around the border, which begins at any of its half-edges.
@@ -242,7 +222,7 @@ def _in_the_plane(topology: Topology) -> FloatArray:
     border = [next(iter(following))]
     while (vertex := following[border[-1]]) != border[0]:
         border.append(vertex)
-    angle = 2 * np.pi * np.arange(len(border)) / len(border)
+    angle = np.linspace(0, 2 * np.pi, len(border), endpoint=False)
     points = np.zeros((t.vertex_count, 2))
     points[border] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     inner = np.setdiff1d(np.arange(t.vertex_count), border)
@@ -250,21 +230,18 @@ def _in_the_plane(topology: Topology) -> FloatArray:
     return points
 
 
-# Of the figure of curvature.
-CURVATURE_VALENCES = (3, 5, 8)
+CURVATURE_VALENCES = (3, 5, 8)  # Vertices in the figure of curvature
 # The ball of `extraordinary` is bent by z += BEND (x^2 - y^2): principal curvatures of about 1 - 2 BEND and 1 + 2 BEND.
 # Without the bend, the symmetry of the ball would make the leading terms at the vertex vanish.
 BEND = 0.35
 # Radius of the discs in the tangent plane, as a part of the largest that the elements at the vertex cover. Within
 # MIDDLE of it, curvature may grow without bound: it decides on no colours, and has no lines.
 RADIUS, MIDDLE = 0.95, 0.1
-# Colours are linear up to this part of the largest curvature, then logarithmic.
-LINEAR = 0.2
+LINEAR = 0.2  # Colours are linear up to this part of the largest curvature, then logarithmic
 # Lines of equal curvature as parts of the largest, up to the border between both signs: a little below zero, as a flat
 # surface has no border.
 NEGATIVE = (-1 / 4, -1 / 16, -1e-3)
-# Curvature below this is a rounding error, in reciprocals of the disc's radius.
-FLAT = 1e-9
+FLAT = 1e-9  # Curvature below this is a rounding error, in reciprocals of the disc's radius
 DEPTHS = np.arange(0, 41)
 # Samples of each level for the plot: near the middles of the three regular children, off their diagonals.
 DIRECTIONS = np.array([(1.0, 0.3), (0.8, 0.7), (0.35, 1.0)])
@@ -288,23 +265,19 @@ def curvature_map(surface: LimitSurface, valence: int, count: int) -> NDArray[np
     # From a thousandth of the element on. The point itself has no curvature, or one of no interest.
     uv = grid_points(np.concatenate([[0], np.geomspace(1e-3, 1, count)]))
     uv[0] = 1e-4
-    points, gaussian, mean = _curvatures(surface, uv, valence)
-    point, axes, _ = frame(surface)
-    x, y, _ = ((points - point) @ axes).T
-    # Positive where the surface bends inward, as on a ball.
-    return np.stack([x, y, gaussian, -mean]).reshape(4, valence, count + 1, count + 1)
-
-
-def _curvatures(surface: LimitSurface, uv: NDArray[np.float64], valence: int) -> tuple[NDArray[np.floating], ...]:
-    """Points, Gaussian and mean curvature at parameters in each of the first elements."""
     samples = surface.evaluate(np.arange(valence)[:, None], uv, derivatives=2)
-    return samples.p, np.asarray(samples.gaussian_curvature), np.asarray(samples.mean_curvature)
+    point, axes, _ = frame(surface)
+    x, y, _ = ((samples.p - point) @ axes).T
+    # Positive where the surface bends inward, as on a ball.
+    gaussian, mean = np.asarray(samples.gaussian_curvature), np.asarray(samples.mean_curvature)
+    return np.stack([x, y, gaussian, -mean]).reshape(4, valence, count + 1, count + 1)
 
 
 def largest_by_level(surface: LimitSurface, valence: int) -> NDArray[np.float64]:
     """Largest absolute principal curvature of a few samples on each level: ``(levels,)``."""
     uv = (np.ldexp(1.0, -DEPTHS)[:, None, None] * DIRECTIONS).reshape(-1, 2)
-    _, gaussian, mean = _curvatures(surface, uv, valence)
+    samples = surface.evaluate(np.arange(valence)[:, None], uv, derivatives=2)
+    gaussian, mean = np.asarray(samples.gaussian_curvature), np.asarray(samples.mean_curvature)
     principal = np.abs(mean) + np.sqrt(np.maximum(mean**2 - gaussian, 0))
     return np.asarray(principal.reshape(valence, len(DEPTHS), -1).max(axis=(0, 2)))
 

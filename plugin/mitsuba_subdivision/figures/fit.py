@@ -21,6 +21,7 @@ from ..device_arrays import upload
 from ..fit import CageFit, LargeSteps, Schedule, View
 from ..fit.cage_fit import with_sample_count
 from ..fit.point_fit import mesh_samples
+from ..fit.smoothness import rows
 from ..messages import counted
 from ..schemes.domain import FloatArray
 from ..shapes.derivatives import loss_of_views
@@ -29,41 +30,32 @@ from ..variants import SceneNode, threads_set
 from .output import BETWEEN, SERIES, FigureError, FigureOptions, panels, write_figure
 from .staging import camera_matrix, edge_rods, limit_surface, load_stage, make_mesh, project, render_panels, staged
 
-# Of all fits: steps, pictures, their pixels, samples, and samples of the pictures that are fitted to.
+# Steps of all fits; pictures, their pixels, samples, and samples of the target's pictures.
 STEPS, CREASE_STEPS = 100, 100
 VIEWS, PIXELS, BOX_PIXELS, SPP, EDGE_SPP, TARGET_SPP = 8, 80, 64, 16, 2, 256
-# Of the target: radius of its core, and how fast arms end to their sides.
-CORE, SHARPNESS_OF_ARMS = 0.45, 9
-# Radius of the ball that fits begin with; the diagonal of the target's box.
-RADIUS, DIAGONAL = 0.6, 2.2
-# How often a cube is halved to be the cage, the mesh, and the target.
-COARSE, DENSE, FINE = 2, 5, 6
+CORE, SHARPNESS_OF_ARMS = 0.45, 9  # Radius of the target's core, and how fast its arms end to their sides
+RADIUS, DIAGONAL = 0.6, 2.2  # The initial ball, and the target's box
+COARSE, DENSE, FINE = 2, 5, 6  # How often a cube is halved to be the cage, the mesh, and the target
 # λ of large steps, and Adam's first and last learning rates, in diagonals: the best of several.
 SMOOTHING, MESH_SMOOTHING = 1.0, 19.0
 RATES, MESH_RATES = (0.1, 0.006), (0.25, 0.01)
-# How often distances are measured; samples of each surface, and segments of a cage's edges there.
-MEASUREMENTS, SAMPLES, SEGMENTS = 16, 30_000, 6
-# When the cage is refined, and when it is shown on its way, as parts of the steps.
-REFINED, SHOWN = 0.3, (0.09, 0.29)
+# Steps after which distances are measured, even on a logarithmic axis; samples of each surface, and segments of a
+# cage's edges there.
+MEASURED: list[int] = np.unique(np.rint(np.geomspace(1, STEPS, 16)).astype(int)).tolist()
+SAMPLES, SEGMENTS = 30_000, 6
+REFINED, SHOWN = 0.3, (0.09, 0.29)  # Parts of the steps before the cage is refined, and shown on its way
 
-# Of the cube that the box is fitted from, and of the box in parts of these.
-SIDE, SIDES = 1.24, (1.25, 1.0, 0.85)
+SIDE, SIDES = 1.24, (1.25, 1.0, 0.85)  # Sides of the initial cube, and of the box as multiples
 # Sharpness of the box's edges: around its top, between top and bottom, and around its bottom; of all edges at first.
 TOP, UPRIGHT, BOTTOM, FIRST, HIGHEST = 2.4, 1.5, 0.5, 0.5, 3
 BOX_RATES, SHARPNESS_RATES = (0.02, 0.001), (0.3, 0.02)
-# Segments of the cages' edges in pictures of the fit of the box, and in renders.
-BOX_RATE, RATE = 8, 16
+BOX_RATE, RATE = 8, 16  # Segments of the cages' edges in pictures of the fit of the box, and in renders
 
-# Fields of view of the first and the last row.
-BALL_VIEW, BOX_VIEW = 11.5, 15.5
+BALL_VIEW, BOX_VIEW = 11.5, 15.5  # Fields of view
 GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}}
 LIGHTS = {
     "sky": {"type": "constant", "radiance": {"type": "rgb", "value": 0.3}},
-    "key": {
-        "type": "directional",
-        "direction": [-1, -0.5, -1],
-        "irradiance": {"type": "rgb", "value": [1.5, 1.2, 1.0]},
-    },
+    "key": {"type": "directional", "direction": [-1, -0.5, -1], "irradiance": {"type": "rgb", "value": [1.5, 1.2, 1]}},
     "fill": {
         "type": "directional",
         "direction": [1, 0.2, 0.5],
@@ -78,11 +70,9 @@ ROD_RADIUS = 0.009
 CREASE_RADIUS, CREASE_GROWTH = 0.010, 0.010
 SHARPNESS_COLOURS = ("#9aa1ab", "#f2a541", "#2f8f83", "#5b2a86")
 LABELS = {"cage": "cage", "refined": "coarse to fine", "mesh": "dense mesh"}
-# Behind numbers, as dark as the backdrop.
-LABEL = "#343d46"
+LABEL = "#343d46"  # Behind numbers, as dark as the backdrop
 
-# A title of two lines, and shapes to be rendered.
-Panel = tuple[str, SceneNode]
+Panel = tuple[str, SceneNode]  # A title of two lines, and shapes to be rendered
 # A box and the sharpness of its edges, those of `cube` in their order.
 Box = tuple[ControlCage, NDArray[np.float64]]
 # The course of a fit: the loss before each step, and cages or triangles of a mesh after some steps.
@@ -97,11 +87,8 @@ def draw_fit(options: FigureOptions) -> list[Path]:
     with threads_set(1):
         shape = _target()
         views = _views_of(make_mesh(shape.positions, shape.triangles, GREY), PIXELS)
-        courses = {
-            "cage": _fit_cage([], views),
-            "refined": _fit_cage([round(REFINED * STEPS)], views),
-            "mesh": _fit_mesh(views),
-        }
+        courses = {"cage": _fit_cage([], views), "refined": _fit_cage([round(REFINED * STEPS)], views)}
+        courses["mesh"] = _fit_mesh(views)
         boxes, sharpness = _fit_creases()
 
     # Twelve panels: pictures of the ball and of the box, in rows that plots of their fits complete.
@@ -151,7 +138,6 @@ def integrator(spp: int, edge_spp: int) -> SceneNode:
 
 
 def _views_of(shape: mi.Shape, pixels: int) -> list[View]:
-    """Pictures of a shape from all around, alternately from above and from below."""
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, **LIGHTS, "shape": shape})
     film = {"type": "hdrfilm", "width": pixels, "height": pixels, "rfilter": {"type": "box"}, "sample_border": True}
     views = []
@@ -165,13 +151,7 @@ def _views_of(shape: mi.Shape, pixels: int) -> list[View]:
     return views
 
 
-def _measured_steps() -> list[int]:
-    """Steps after which the distance to the target is measured, evenly on a logarithmic axis."""
-    return sorted(set(np.rint(np.geomspace(1, STEPS, MEASUREMENTS)).astype(int).tolist()))
-
-
 def _fit_cage(refine: list[int], views: list[View]) -> Course:
-    """Fit a cage, which is refined before some steps."""
     fit = CageFit(
         ball_cage(COARSE, RADIUS),
         views,
@@ -183,7 +163,7 @@ def _fit_cage(refine: list[int], views: list[View]) -> Course:
         spp=SPP,
     )
     cages = {0: fit.cage}
-    for step in _measured_steps():
+    for step in MEASURED:
         cages[step] = fit.run(step - len(fit.losses)).cage
     return fit.losses, cages
 
@@ -214,11 +194,9 @@ def _fit_mesh(views: list[View]) -> Course:
         optimizer.set_learning_rate(rate(step) * DIAGONAL)
         optimizer.step()
         losses.append(float(np.array(loss).item()) / len(views))
-        with dr.suspend_grad():
-            params[key] = large_steps.from_differential(optimizer["u"])
-        if step + 1 in _measured_steps():
-            positions = np.array(params[key], dtype=np.float64).reshape(-1, 3)
-            meshes[step + 1] = mesh.with_positions(positions)
+        if step + 1 in MEASURED:
+            with dr.suspend_grad():
+                meshes[step + 1] = mesh.with_positions(rows(large_steps.from_differential(optimizer["u"])))
     return losses, meshes
 
 
@@ -292,11 +270,10 @@ def _rods(cage: ControlCage) -> mi.Shape:
 
 
 def _box_panels(boxes: Sequence[Box]) -> list[Panel]:
-    """Panels of the last row: the target with its creases, the start, and the result."""
     shown: list[Panel] = []
-    titles = "target\nthree kinds\nof creases", f"start\nall creases\n{FIRST:g}"
-    last = f"found\n{VIEWS * CREASE_STEPS:,} renders"
-    for title, (cage, sharpness) in zip((*titles, last), boxes, strict=True):
+    found = f"found\n{VIEWS * CREASE_STEPS:,} renders"
+    titles = "target\nthree kinds\nof creases", f"start\nall creases\n{FIRST:g}", found
+    for title, (cage, sharpness) in zip(titles, boxes, strict=True):
         # Rods are thicker, and of another colour, where creases are sharper.
         looks = [(_sharpness_colour(value), CREASE_RADIUS + CREASE_GROWTH * value) for value in sharpness.tolist()]
         rods = edge_rods(cage, cube().edges, sharpness, looks)
@@ -343,7 +320,6 @@ def _finish(axis: Axes, quantity: str, *, is_logarithmic: bool = False) -> None:
 
 
 def _label(axis: Axes, sensor: mi.Sensor, cage: ControlCage, sharpness: FloatArray) -> None:
-    """Write their sharpness on the edges that the camera sees."""
     box = {"boxstyle": "round,pad=0.15", "facecolor": LABEL, "edgecolor": "none"}
     for edge in np.flatnonzero(in_front(cage, camera_matrix(sensor)[:3, 3])):
         x, y = project(sensor, cage.positions[cube().edges[edge]].mean(axis=0)).tolist()

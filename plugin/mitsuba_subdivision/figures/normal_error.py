@@ -34,15 +34,12 @@ from .output import BETWEEN, SERIES, FigureError, FigureOptions, label_powers, p
 from .peers import osd_peer, osd_samples
 
 # Vertices within this radius of the extraordinary vertex show their normals, as needles of this length.
-NEEDLE_RADIUS = 0.3
-NEEDLE_LENGTH = 0.07
-# Edges of the cage that begin within this radius of the extraordinary vertex are drawn.
-EDGE_RADIUS = 0.8
-# What lambda_2^n is at the sample of a cage of a user: eps |c1| / lambda_2^n is 30.
-LOST = 2.0**-23 / 3
-DISTANCE = 10  # Of the extraordinary point from the origin
+NEEDLE_RADIUS, NEEDLE_LENGTH = 0.3, 0.07
+EDGE_RADIUS = 0.8  # Edges of the cage that begin within this radius of the extraordinary vertex are drawn
+LOST = 2.0**-23 / 3  # lambda_2^n at the sample of a user's cage: eps |c1| / lambda_2^n is 30
+DISTANCE = 10  # From the origin to the extraordinary point
 CLAY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.72, 0.66, 0.58]}}
-TURNS = Rotation.random(20, random_state=19).as_matrix()  # Of the figures' own cages
+TURNS = Rotation.random(20, random_state=19).as_matrix()  # Directions of the figures' own cages
 # By scheme and valence: the u = v at which the extraordinary point is sampled, and the tessellation rate. At |c1| = 10
 # and about these u = v, float32 loses the normal: its error is about eps |c1| / lambda_2^n, where the subdominant
 # eigenvalues are 0.41 and 0.55 (Catmull-Clark), 0.25 and 0.45 (Loop), 0.5 (Doo-Sabin). The smaller these are, the
@@ -85,7 +82,7 @@ def turned(cage: ControlCage) -> list[ControlCage]:
 
 
 def of_user(path: Path, scheme: str, most: int) -> dict[str, list[ControlCage]]:
-    """A user's cage by its vertices, in its own directions, with edges at the vertex as long as the figures' own."""
+    """A user's cage by its vertices, not turned, with edges at the vertex as long as the figures' own."""
     if scheme != "catmull_clark":
         raise FigureError(f"--cage together with --scheme {scheme}; expected catmull_clark")
     length = staging.frame(surface_of(scheme, 5))[2]
@@ -145,7 +142,6 @@ def _lost_at(cage: ControlCage) -> float:
 
 
 def _draw_lines(axis: Axes, sensor: mi.Sensor, surface: LimitSurface, mesh: Tessellation, to_world: FloatArray) -> None:
-    """Draw normals near the extraordinary vertex, and edges of the cage on the surface."""
     distance = np.linalg.norm(mesh.positions - mesh.positions[0], axis=1)
     near = np.flatnonzero(distance < NEEDLE_RADIUS)
     start = mesh.positions[near].astype(np.float64)
@@ -162,18 +158,16 @@ def _draw_lines(axis: Axes, sensor: mi.Sensor, surface: LimitSurface, mesh: Tess
     axis.add_collection(LineCollection([first], colors="#d8452a", linewidths=1.5, capstyle="round"))
 
 
-# Of the plot of errors against levels.
-VALENCES = (3, 5)
-OFFSETS = (0, 1, 100)
+# Panels and levels of the plot of errors.
+VALENCES, OFFSETS = (3, 5), (0, 1, 100)
 LEVELS = np.arange(61)
 # Directions of the samples at each level: one in each regular child, and one on the line between two.
 DIRECTIONS = np.array([(1.0, 0.25), (0.75, 0.75), (0.25, 0.75), (1.0, 0.5)])
-# Digits of the exact arithmetic: at level 60, differences are of size 0.41^60 = 1e-23, and keep twenty digits and more.
+# Digits of the exact arithmetic: differences at level 60, of size 0.41^60 = 1e-23, keep twenty digits and more.
 DIGITS = 60
 EQUATIONS: dict[Evaluator, str] = {"stam": "(11) Stam", "stabilized": "(12) stabilised", "limit": "(13) limit"}
 PRECISIONS = {np.float32: "-", np.float64: "--"}
-# Between the markers of a line, in levels.
-MARKED = 10
+MARKED = 10  # Levels between the markers of a line
 
 
 def draw_error(options: FigureOptions) -> list[Path]:
@@ -190,12 +184,10 @@ def draw_error(options: FigureOptions) -> list[Path]:
     for top, bottom, offset in zip(axes[0], axes[-1], OFFSETS, strict=True):
         top.set_title(f"|c₁| = {offset}")
         bottom.set_xlabel("level $n$")
-    figure.legend(
-        *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4 if options.width > BETWEEN else 2
-    )
-    return write_figure(
-        options, "error", figure, cage=f"{len(TURNS)} turns of extraordinary(3) and (5)", numbers=numbers
-    )
+    columns, handles = 4 if options.width > BETWEEN else 2, axes[0, 0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=columns)
+    cage = f"{len(TURNS)} turns of extraordinary(3) and (5)"
+    return write_figure(options, "error", figure, cage=cage, numbers=numbers)
 
 
 def _draw_panel(axis: Axes, cages: list[ControlCage], offset: float) -> list[tuple[object, ...]]:
@@ -233,7 +225,7 @@ def offset_cage(cage: ControlCage, offset: float, scheme: str | None = None, dty
 
 
 def normal_errors(cage: ControlCage, exact: FloatArray, evaluator: Evaluator, dtype: Any) -> FloatArray:
-    """Largest angle in degrees between computed and exact normal over the samples of each level: ``(levels,)``."""
+    """Largest error of computed normals in degrees over the samples of each level: ``(levels,)``."""
     uv = (np.ldexp(1.0, -LEVELS)[:, None, None] * DIRECTIONS).reshape(-1, 2)
     normals = LimitSurface(cage).evaluate(0, uv, evaluator=evaluator, dtype=dtype).n.astype(np.float64)
     # Where derivatives came out parallel or zero, there is no normal. That counts as the largest error.
@@ -274,11 +266,10 @@ def _exactly(table: NDArray, row_sum: int | None = None) -> NDArray[np.object_]:
     return exact
 
 
-# Of the zoom: the surface at a vertex, magnified, with normals by (11), by (12), and by OpenSubdiv where `osd_peer` is.
+# The zoom shows a vertex with normals by (11), by (12), and by OpenSubdiv where `osd_peer` is found.
 ZOOM_VALENCE, ZOOM_OFFSET = 5, 10
 MAGNIFICATIONS = (1, 100, 10_000, 1_000_000)
-# The deepest level at which OpenSubdiv's patch tables can isolate extraordinary vertices.
-OPENSUBDIV_LEVEL = 10
+OPENSUBDIV_LEVEL = 10  # Patch tables cannot isolate extraordinary vertices at deeper levels
 Method = Evaluator | Literal["opensubdiv"]
 METHODS: dict[Method, str] = {
     "stam": EQUATIONS["stam"],
@@ -286,8 +277,7 @@ METHODS: dict[Method, str] = {
     "stabilized": EQUATIONS["stabilized"],
 }
 # Half the width of the image at magnification 1: the elements at the point just fill it. The cage has the radius 1.
-HALF_WIDTH = 0.19
-BAR = 0.1
+HALF_WIDTH, BAR = 0.19, 0.1
 # Range of the colours in degrees. Below the least error, float32 cannot tell most unit vectors from the exact ones.
 LEAST_ERROR, MOST_ERROR = 1e-6, 100
 COLOURS, ERROR_SCALE = "magma_r", LogNorm(LEAST_ERROR, MOST_ERROR, clip=True)
@@ -311,7 +301,7 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
     rendered, records = [], []
     for magnification, column in zip(MAGNIFICATIONS, axes.T, strict=True):
         samples = panel_samples(surface, magnification, count)
-        # Of all elements' samples, the one that is nearest to the centre of each pixel, ``(height, width)``.
+        # The sample of all elements that is nearest to the centre of each pixel, ``(height, width)``
         points = samples[1].reshape(-1, 3)
         centres = staging.grid_points(np.arange(resolution) + 0.5).reshape(resolution, -1, 2)
         nearest = np.asarray(cKDTree(staging.project(sensor, points)).query(centres)[1])
@@ -338,8 +328,7 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
     colours.set_label("error of the normal in degrees; medians below panels")
     label_powers(colours.ax.yaxis)
     strips = [pixels for i in range(len(rows)) for pixels in rendered[i :: len(rows)]]
-    count = len(MAGNIFICATIONS)
-    cage = f"extraordinary({ZOOM_VALENCE}), turned, {ZOOM_OFFSET} from the origin"
+    count, cage = len(MAGNIFICATIONS), f"extraordinary({ZOOM_VALENCE}), turned, {ZOOM_OFFSET} from the origin"
     return write_figure(options, "zoom", figure, strips, cage=cage, per_row=count, pictures=records)
 
 
@@ -356,24 +345,22 @@ def panel_samples(surface: LimitSurface, magnification: float, count: int) -> tu
     from the origin, float32 cannot tell the points of the last panels apart.
     """
     uv = staging.grid_points(np.linspace(0, 1, count + 1))
-    # Stam's form has no value at the point itself.
-    uv[0] = 0.1 / count
+    uv[0] = 0.1 / count  # Stam's form has no value at the point itself
     uv *= parameter_extent(magnification)
     exact = surface.evaluate(np.arange(ZOOM_VALENCE)[:, None], uv)
-    shape = ZOOM_VALENCE, len(uv), 3
-    return uv, on_stage(surface, exact.p, magnification).reshape(shape), exact.n.reshape(shape)
+    points, normals = (v.reshape(ZOOM_VALENCE, -1, 3) for v in (on_stage(surface, exact.p, magnification), exact.n))
+    return uv, points, normals
 
 
 def normals_by(surface: LimitSurface, samples: tuple[FloatArray, ...], method: Method) -> tuple[Any, Any, float]:
-    """Normals in float32 at `panel_samples`, their angles to the exact ones in degrees, and the median in the image."""
+    """Normals in float32 at `panel_samples`, their errors in degrees, and the median of these in the image."""
     (uv, positions, exact), elements = samples, np.arange(ZOOM_VALENCE)[:, None]
-    if method == "opensubdiv":
-        program = osd_peer()
-        if program is None:
-            raise FigureError("the program osd_peer is gone; expected it where it was found before")
+    if method != "opensubdiv":
+        normals = surface.evaluate(elements, uv, evaluator=method, dtype=np.float32).n.astype(np.float64)
+    elif program := osd_peer():
         normals = osd_samples(program, surface.cage, elements, uv, "far", OPENSUBDIV_LEVEL)[1]
     else:
-        normals = surface.evaluate(elements, uv, evaluator=method, dtype=np.float32).n.astype(np.float64)
+        raise FigureError("the program osd_peer is gone; expected it where it was found before")
     normals = np.nan_to_num(normals).reshape(exact.shape)
     # Where derivatives are parallel or vanish, there is no normal. That counts as the largest error.
     angle = np.where(normals.any(axis=-1), normal_angle(normals, exact), 180)
@@ -388,16 +375,14 @@ def _level_lines(surface: LimitSurface, magnification: float) -> NDArray[np.floa
     extent = parameter_extent(magnification)
     # The lines u = 1/2^n and v = 1/2^n of every level n that the image resolves.
     first = int(np.floor(-np.log2(extent))) - 1
-    curves = []
-    for level in range(max(first, 0), first + 7):
-        curves += [line * 2.0**-level, line[:, ::-1] * 2.0**-level]
-    curves.append(np.stack([along, np.zeros_like(along)], axis=1) * extent)
-    points = surface.evaluate(np.arange(ZOOM_VALENCE)[:, None], np.concatenate(curves)).p
+    sides = 2.0 ** -np.arange(max(first, 0), first + 7)[:, None, None]
+    axis = np.stack([along, np.zeros_like(along)], axis=1) * extent
+    curves = np.concatenate([sides * line, sides * line[:, ::-1], axis[None]]).reshape(-1, 2)
+    points = surface.evaluate(np.arange(ZOOM_VALENCE)[:, None], curves).p
     return on_stage(surface, points, magnification).reshape(-1, LINE_POINTS, 3)
 
 
 def _draw_halves(axis: Axes, pixels: NDArray[np.float32], errors: FloatArray, lines: FloatArray) -> None:
-    """Draw a rendered image, errors in degrees over its right half, and lines in pixels over both."""
     height, width = errors.shape
     axis.imshow(staging.in_8_bits(pixels), interpolation="lanczos")
     right = (width // 2, width, height, 0)

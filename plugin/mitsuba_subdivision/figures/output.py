@@ -66,13 +66,13 @@ class FigureError(RuntimeError):
 class FigureOptions:
     """Options of a figure."""
 
-    output: Path  # Folder to write to; created if it is missing
-    resolution: int = 512  # Width of a panel in pixels, at which pictures are rendered
-    spp: int = 256  # Samples per pixel of a rendered image
-    width: float = PAGE  # Width of the figure on paper in millimetres
-    formats: tuple[str, ...] = ("png", "pdf", "exr", "csv")  # Which of these to write, if the figure has them
-    scheme: str = "catmull_clark"  # Subdivision scheme, for the figures that show one scheme of several
-    cage: Path | None = None  # File of a Catmull-Clark cage to show, for the figures that take one
+    output: Path  # Folder, created if it is missing
+    resolution: int = 512  # Width of a panel in pixels
+    spp: int = 256  # Samples per pixel
+    width: float = PAGE  # Width on paper in millimetres
+    formats: tuple[str, ...] = ("png", "pdf", "exr", "csv")  # Written if the figure has them
+    scheme: str = "catmull_clark"
+    cage: Path | None = None  # File of a Catmull-Clark cage to show in place of the figure's own
 
     def command(self, name: str, variant: str | None) -> str:
         """The command line that draws a figure again, with the variant and samples if it is rendered."""
@@ -84,12 +84,8 @@ class FigureOptions:
 
 
 def panels(options: FigureOptions, rows: int, columns: int, **more: Any) -> tuple[Figure, Any]:
-    """Make axes in rows and columns over the width of the figure; their heights follow when it is written.
-
-    More options are for `matplotlib.pyplot.subplots`.
-    """
-    # Not above, as the command line imports this module for every command.
-    import matplotlib
+    """Make axes by `matplotlib.pyplot.subplots` over the width of the figure; `write_figure` sets its height."""
+    import matplotlib  # Not above, as the command line imports this module for every command
 
     matplotlib.use("Agg")
     # Fixed dates and identifiers in files, so that the same command twice gives the same file.
@@ -97,9 +93,8 @@ def panels(options: FigureOptions, rows: int, columns: int, **more: Any) -> tupl
     matplotlib.rcParams.update({**STYLE, "font.size": TEXT_SIZES[options.width >= BETWEEN]})
     from matplotlib import pyplot
 
-    width = options.width / INCH
-    # As high as rows of panels that are twice as high as wide.
-    size = (width, 1 + 2 * rows * width / columns)
+    # Room for panels that are twice as high as wide.
+    size = np.array([1, 2 * rows / columns]) * options.width / INCH + [0, 1]
     return pyplot.subplots(rows, columns, figsize=size, layout="compressed", squeeze=False, **more)
 
 
@@ -119,12 +114,11 @@ def write_figure(
     pixels: int | None = None,  # Width of the first axes; by default, that of the options
     layouts: int = LAYOUTS,  # How often the height of the figure is set to that of its contents
     numbers: Sequence[Sequence[object]] = (),  # Rows of a table, names of columns first
-    **metadata: Any,  # Of the pixels, besides their samples
+    **metadata: Any,  # Further metadata of the OpenEXR file
 ) -> list[Path]:
     """Write a figure as PNG and PDF, its pictures as OpenEXR and its numbers as CSV, where wanted, and close it.
 
-    Pictures keep their pixels in PDF. Images have the version, the command and the cage as metadata. Returns the files
-    written, each of which appears whole or not at all.
+    Pictures keep their pixels in PDF. Images have the version, the command and the cage as metadata.
     """
     import mitsuba as mi
     from matplotlib.image import AxesImage
@@ -151,21 +145,20 @@ def write_figure(
         if path.suffix == ".csv":
             with whole_file(path) as beside, beside.open("w", newline="", encoding="utf-8") as file:
                 csv.writer(file).writerows(numbers)
-            continue
-        if path.suffix == ".exr":
+        elif path.suffix == ".exr":
             from ..regression.image import write_exr
 
             count = per_row or len(rendered)
             rows = [np.concatenate(rendered[i : i + count], axis=1) for i in range(0, len(rendered), count)]
             write_exr(path, np.concatenate(rows)[..., :3], {**origin, **metadata, "spp": options.spp})
-            continue
-        is_pdf = path.suffix == ".pdf"
-        keys = ("Creator", "Subject", "Keywords") if is_pdf else ("Software", "Description", "Source")
-        more: dict[str, Any] = {} if is_pdf else {"pil_kwargs": {"optimize": True}}
-        if is_pdf:
-            setp(images, interpolation="none")
-        with whole_file(path) as beside:
-            figure.savefig(beside, dpi=dpi, metadata=dict(zip(keys, origin.values(), strict=True)), **more)
+        else:
+            is_pdf = path.suffix == ".pdf"
+            keys = ("Creator", "Subject", "Keywords") if is_pdf else ("Software", "Description", "Source")
+            more: dict[str, Any] = {} if is_pdf else {"pil_kwargs": {"optimize": True}}
+            if is_pdf:
+                setp(images, interpolation="none")
+            with whole_file(path) as beside:
+                figure.savefig(beside, dpi=dpi, metadata=dict(zip(keys, origin.values(), strict=True)), **more)
     close(figure)
     return paths
 

@@ -21,9 +21,10 @@ from ..cage import ControlCage
 from ..messages import print_remark
 from .output import FigureError
 
+# Before each array: its name, its type, and the number of its values.
+_HEADER = np.dtype([("name", "S16"), ("type", "S8"), ("size", "<i8")])
 # Environment variable with the folder of the programs, where that is not on the path.
 VARIABLE = "MITSUBA_SUBDIVISION_PEERS"
-# The script that Blender runs.
 BLENDER_SCRIPT = Path(__file__).with_name("blender_script.py")
 
 
@@ -47,27 +48,20 @@ def _program(name: str, *more: str) -> Path | None:
 
 
 def osd_samples(
-    program: Path,  # As `osd_peer` returns it
-    cage: ControlCage,  # Quads, without tags
-    element: ArrayLike,  # (s,) int: broadcasts with `uv`
-    uv: ArrayLike,  # (s, 2)
-    method: str,  # Patch tables, or surfaces of single faces
-    # For "far", the level at which extraordinary vertices are isolated, at most 10; for "bfr", the level of its
-    # approximation
-    level: int,
+    program: Path, cage: ControlCage, element: ArrayLike, uv: ArrayLike, method: str, level: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Points and unit normals ``(s, 3)`` of OpenSubdiv's Catmull-Clark surface in float32, its usual precision.
 
-    Normals are not a number where derivatives are parallel or vanish.
+    The cage has quads without tags; elements broadcast with parameters ``(s, 2)``. The method is "far", patch tables
+    that isolate extraordinary vertices at a level up to 10, or "bfr", surfaces of single faces that are approximated
+    at a level. Normals are not a number where derivatives are parallel or vanish.
     """
     element, u, v = np.broadcast_arrays(element, np.asarray(uv)[..., 0], np.asarray(uv)[..., 1])
+    integers = {"widths": [3, 0], "sizes": cage.face_sizes, "corners": cage.face_vertices, "face": element}
     records: dict[str, NDArray] = {
-        "widths": np.array([3, 0], dtype=np.int32),
-        "values": cage.positions,
-        "sizes": cage.face_sizes.astype(np.int32),
-        "corners": cage.face_vertices.astype(np.int32),
-        "face": element.astype(np.int32),
+        **{name: np.asarray(values, dtype=np.int32) for name, values in integers.items()},
         "sub": np.zeros(element.size, dtype=np.int32),
+        "values": cage.positions,
         "uv": np.stack([u, v], axis=-1).astype(np.float64),
     }
     options = ["--method", method, "--level", str(level), "--real", "float"]
@@ -78,12 +72,8 @@ def osd_samples(
         return points, cross / np.linalg.norm(cross, axis=1, keepdims=True)
 
 
-def blender_mesh(
-    program: Path,  # As `blender` returns it
-    cage: ControlCage,  # Without tags; Catmull-Clark's
-    level: int,  # Edges of quads become `2 ** level` segments
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int32], str]:
-    """Points and shading normals ``(n, 3)`` of Blender's modifier, its faces ``(m, 4)``, and Blender's version."""
+def blender_mesh(program: Path, cage: ControlCage, level: int) -> tuple[NDArray, NDArray, NDArray, str]:
+    """Points and shading normals ``(n, 3)`` of Blender's modifier at a level, faces ``(m, 4)``, Blender's version."""
     # Several threads race for the last bits of points that faces share.
     options = ["--threads", "1", "--background", "--factory-startup", "--python-exit-code", "1"]
     options += ["--python", str(BLENDER_SCRIPT), "--"]
@@ -111,19 +101,16 @@ def as_bytes(records: Mapping[str, NDArray]) -> bytes:
     """Arrays of int32 and float64, as the peers' programs read them (``peer_common.h``)."""
     data = b""
     for name, values in records.items():
-        kind = b"i" if values.dtype == np.int32 else b"d"
-        data += name.encode().ljust(16, b"\0") + kind.ljust(8, b"\0") + np.int64(values.size).tobytes()
-        data += values.tobytes()
+        kind = "i" if values.dtype == np.int32 else "d"
+        data += np.array((name, kind, values.size), _HEADER).tobytes() + values.tobytes()
     return data
 
 
 def from_bytes(data: bytes) -> dict[str, NDArray]:
     """Arrays that `as_bytes` or a peer's program wrote."""
     records: dict[str, NDArray] = {}
-    at = 0
-    while at < len(data):
-        name, kind = data[at : at + 16].rstrip(b"\0").decode(), data[at + 16 : at + 17]
-        count = int(np.frombuffer(data, np.int64, 1, at + 24)[0])
-        records[name] = np.frombuffer(data, np.int32 if kind == b"i" else np.float64, count, at + 32)
-        at += 32 + records[name].nbytes
+    while data:
+        (name, kind, count), rest = np.frombuffer(data, _HEADER, 1)[0], data[_HEADER.itemsize :]
+        values = records[name.decode()] = np.frombuffer(rest, np.int32 if kind == b"i" else np.float64, count)
+        data = rest[values.nbytes :]
     return records

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -53,16 +54,12 @@ def _draw_row(options: FigureOptions, name: str, cage: str, cases: Mapping[str, 
     return write_figure(options, name, figure, rendered, cage=cage, **metadata)
 
 
-# Of the jar: how far triangles may be from the surface, in pixels, and in the slice where they are drawn.
-PIXEL_ERROR, PIXEL_ERROR_OF_LINES = 0.08, 1.5
-SCALE = 0.115
-# Where slices end, as parts of the width.
-ENDS = (0.0, 0.35, 0.64, 1.0)
-# Of the image of heights, around the jar and along its profile.
-COLUMNS, ROWS = 1536, 1536
-# How many grooves of a kind go around the jar, and how many cushions up; between which parts of the profile.
-AROUND, UP = 12, 10
-LOWEST, HIGHEST = 0.10, 0.70
+# Pixels from triangles of the jar to the surface at most; more in the slice where triangles are drawn.
+PIXEL_ERROR, PIXEL_ERROR_OF_LINES, SCALE = 0.08, 1.5, 0.115
+ENDS = (0.0, 0.35, 0.64, 1.0)  # Where slices end, as parts of the width
+COLUMNS, ROWS = 1536, 1536  # Pixels of the image of heights, around the jar and along its profile
+# Grooves of a kind around the jar, and cushions from one part of its profile up to another.
+AROUND, UP, LOWEST, HIGHEST = 12, 10, 0.10, 0.70
 # Radius of beads, and height over which cushions grow, in cushions; how round grooves are. Slopes of a bitmap jump at
 # its texels, which shows as dashes along grooves that are two texels wide: these are eight wide.
 BEAD, FADE, SOFT = 0.21, 0.5, 0.1
@@ -85,17 +82,12 @@ def draw_displacement(options: FigureOptions) -> list[Path]:
     heights = mi.load_dict({"type": "bitmap", "data": upload(mi.TensorXf, quilt()[..., None]), "raw": True})
     displaced = {**plain, "displacement": heights, "displacement_scale": SCALE}
     coarse = mi.load_dict({**displaced, "pixel_error": PIXEL_ERROR_OF_LINES})
-    slices = {
-        "limit surface": mi.load_dict(plain),
-        "displaced": mi.load_dict(displaced),
-        "triangles": _with_lines(coarse),
-    }
+    slices = (mi.load_dict(plain), mi.load_dict(displaced), _with_lines(coarse))
     columns = [round(end * width) for end in ENDS]
     rendered = []
-    for i, (name, jar) in enumerate(slices.items()):
-        first, count = columns[i], columns[i + 1] - columns[i]
-        stage = load_stage("displacement", width=width, height=height, first_column=first, columns=count)
-        rendered.append(render(staged(stage, jar=jar), options, name)[..., :3])
+    for jar, (first, end) in zip(slices, itertools.pairwise(columns), strict=True):
+        stage = load_stage("displacement", width=width, height=height, first_column=first, columns=end - first)
+        rendered.append(render(staged(stage, jar=jar), options, "slice")[..., :3])
     pixels = np.concatenate(rendered, axis=1)
     return draw_picture(options, "displacement", pixels, columns[1:-1], cage="jar.obj", pixel_error=PIXEL_ERROR)
 

@@ -24,11 +24,11 @@ from .output import FigureError, FigureOptions, panels, show, write_figure
 
 # Samples of one part: they decide how much memory a render takes, and how often its progress is shown.
 PART_SAMPLES = 1 << 26
-# A picture that stands alone is wider than those that share a figure, by this factor, and 8 : 5.
+# A picture that stands alone is wider than panels of a figure, by this factor, and 8 : 5.
 WIDER, HEIGHT = 2.25, 0.625
 # Points are lifted off their surface by this part of their distance to the camera, before they are tested.
 LIFT = 2e-3
-REFINEMENTS = 2  # Of a cage, until an extraordinary vertex has no other one in the faces around it
+REFINEMENTS = 2  # Isolate every extraordinary vertex
 # Faces whose control points are farther from the vertex than this are holes, in lengths of the shortest edge there.
 FAR = 4
 # Sizes of a cage that stands before a camera, the largest first, and what stays free at each side of the picture.
@@ -43,19 +43,16 @@ def load_stage(name: str, **parameters: str | float) -> mi.Scene:
 
 
 def make_mesh(
-    positions: NDArray[np.floating],  # (n, 3)
-    triangles: NDArray[np.integer],  # (m, 3) int
-    bsdf: SceneNode,  # As for `mi.load_dict`
-    **buffers: NDArray[np.floating],  # Others of `mitsuba_mesh`
+    positions: NDArray[np.floating], triangles: NDArray[np.integer], bsdf: SceneNode, **buffers: NDArray[np.floating]
 ) -> mi.Mesh:
-    """Make a Mitsuba mesh. Without `vertex_normals`, Mitsuba averages those of the triangles."""
+    """Make a mesh with buffers of `mitsuba_mesh`; without `vertex_normals`, it gets averages of the triangles' own."""
     averages = "vertex_normals" not in buffers
     buffers["vertex_positions"] = positions
     return mitsuba_mesh("figure", triangles, buffers, bsdf=mi.load_dict(bsdf), averages_normals=averages)
 
 
 def limit_surface(cage: ControlCage, rate: int, bsdf: SceneNode | mi.BSDF, **parameters: Any) -> mi.Shape:
-    """The limit surface of a cage, with so many segments per edge."""
+    """The limit surface of a cage, with ``rate`` segments per edge."""
     given = {**cage.as_properties(mi), "tessellation_rate": rate, "bsdf": bsdf, **parameters}
     return mi.load_dict({"type": "subdivision", **given})
 
@@ -119,12 +116,9 @@ def paint(colour: str | tuple[float, float, float]) -> SceneNode:
 
 
 def edge_rods(
-    cage: ControlCage,
-    edges: NDArray[np.integer],  # (n, 2) int: ends
-    sharpness: NDArray[np.floating],  # (n,)
-    looks: Sequence[tuple[str | tuple[float, float, float], float]],  # (n): colour in sRGB and radius
+    cage: ControlCage, edges: NDArray[np.integer], sharpness: NDArray[np.floating], looks: Sequence[tuple[Any, float]]
 ) -> SceneNode:
-    """Rods along edges of a cage, with joints at their ends."""
+    """Rods along edges of a cage, given by their ends ``(n, 2)``, with joints there; by colours in sRGB and radii."""
     shapes: SceneNode = {}
     # The sharpest edge comes last: a vertex keeps the joint of that edge.
     for edge in np.argsort(sharpness, kind="stable"):
@@ -177,7 +171,7 @@ def project(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.float
 
 
 def visible(scene: mi.Scene, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Whether nothing of the scene lies between each point ``(n, 3)`` and its orthographic camera."""
+    """Whether no part of the scene lies between each point ``(n, 3)`` and its orthographic camera."""
     sensor = scene.sensors()[0]
     backward = -camera_matrix(sensor)[:3, 2]
     start = points + LIFT * _in_camera(sensor, points)[:, 2:] * backward
@@ -191,10 +185,8 @@ def visible_runs(scene: mi.Scene, lines: NDArray[np.floating]) -> list[NDArray[n
     """Parts of polylines ``(m, points, 3)`` that the camera sees, in pixels, each ``(.., 2)``."""
     seen = visible(scene, lines.reshape(-1, 3)).reshape(lines.shape[:2])
     positions = project(scene.sensors()[0], lines)
-    runs = []
-    for line, shown in zip(positions, seen, strict=True):
-        changes = 1 + np.flatnonzero(np.diff(shown))
-        runs += np.split(line, changes)[0 if shown[0] else 1 :: 2]
+    parts = [np.ma.flatnotmasked_contiguous(np.ma.array(shown, mask=~shown)) for shown in seen]
+    runs = [line[part] for line, its_parts in zip(positions, parts, strict=True) for part in its_parts]
     return [run for run in runs if len(run) > 1]
 
 
@@ -208,10 +200,10 @@ def _in_camera(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.fl
 
 
 def around_vertices(path: Path, most: int) -> dict[str, ControlCage]:
-    """A Catmull-Clark cage, numbered from each of some extraordinary vertices on, those of the lowest valences.
+    """A Catmull-Clark cage, renumbered from its extraordinary vertices of lowest valences, by their names.
 
-    That is vertex 0, the first faces lie around it, and each of them begins with it. Keys name the vertices. Centres of
-    faces are vertices of the refined cage; they count only if there are no others.
+    That vertex is vertex 0, the first faces lie around it, and each of them begins with it. Centres of faces are
+    vertices of the refined cage; they count only if there are no others.
     """
     cage, name = read(path), "valence"
     count = cage.vertex_count
@@ -240,7 +232,7 @@ def moved(points: NDArray[np.floating], matrix: NDArray[np.floating]) -> NDArray
 
 
 def read(path: Path) -> ControlCage:
-    """Read a cage, which has to be of Catmull-Clark surfaces. Warns about it the first time only."""
+    """Read a cage of Catmull-Clark surfaces. Warns about it the first time only."""
     return _read(path, path.stat().st_mtime_ns)
 
 

@@ -9,7 +9,6 @@ import mitsuba as mi
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
 from ..cage import ControlCage
 from ..cage.named_cages import cube
@@ -21,8 +20,7 @@ from . import staging
 from .output import FigureOptions, hide_frame, panels, show, write_figure
 from .peers import blender, blender_mesh, osd_peer, osd_samples
 
-# Level of the refined mesh, as programs without limit surfaces render it.
-LEVEL = 3
+LEVEL = 3  # Level of the refined mesh, as programs without limit surfaces render it
 # Level of all other surfaces, so that they differ only in points and normals at the vertices; of a user's cage, whose
 # faces around a vertex are as many as a hundred, the second one.
 FINE_LEVEL, OWN_LEVEL = 7, 5
@@ -69,8 +67,13 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
     tip = surface.evaluate(at[0], np.zeros((1, 2)), at[1]).p
 
     figure, axes = panels(options, 2, len(shapes))
-    for axis, name in zip(axes[0], shapes, strict=True):
-        _draw_bands(axis, pixels[name], pixels["exact"], *titles[name])
+    for axis, (name, drawn) in zip(axes[0], pixels.items(), strict=True):
+        # Coloured where bands differ from those of the exact surface.
+        wrong = np.clip(np.abs(drawn - pixels["exact"])[..., :3].mean(axis=-1, keepdims=True) / (LIGHT - DARK), 0, 1)
+        marked = (1 - wrong) * staging.on_white(drawn) + wrong * WRONG
+        (title, caption), share = titles[name], f"{100 * wrong.mean():.1f} % wrong"
+        caption = f"{caption}\n{'reference' if name == 'exact' else share}"
+        show(axis, marked.round().astype(np.uint8), title, caption)
     largest = max(angle.max() for angle in angles.values()) or 1
     for axis, angle in zip(axes[1, 1:], angles.values(), strict=True):
         shown = axis.imshow(angle, cmap="magma_r", vmin=0, vmax=largest, interpolation="nearest")
@@ -115,32 +118,22 @@ def _shapes(cage: ControlCage, level: int) -> tuple[dict[str, Any], dict[str, tu
     return shapes, titles
 
 
-def _draw_bands(axis: Axes, pixels: NDArray[np.float32], exact: NDArray[np.float32], title: str, caption: str) -> None:
-    """Draw a rendered image, with colour where its bands differ from those of the exact surface."""
-    wrong = np.clip(np.abs(pixels - exact)[..., :3].mean(axis=-1, keepdims=True) / (LIGHT - DARK), 0, 1)
-    marked = (1 - wrong) * staging.on_white(pixels) + wrong * WRONG
-    share = "reference" if pixels is exact else f"{100 * wrong.mean():.1f} % wrong"
-    show(axis, marked.round().astype(np.uint8), title, f"{caption}\n{share}")
-
-
 def _draw_overview(axis: Axes, options: FigureOptions, shape: mi.Shape) -> None:
-    """Draw the whole surface, with a frame where the close-up is."""
     stage = staging.load_stage("zebra", resolution=options.resolution, fov=WIDE_FIELD_OF_VIEW)
     scene = staging.staged(stage, shape=shape, stripes=_stripes(stage.sensors()[0], WIDE_STRIPES))
     caption = "around the vertex" if options.cage else "whole surface"
     show(axis, staging.on_white(staging.render(scene, options, "whole surface")), caption=caption)
-    middle = options.resolution / 2
-    half = np.tan(np.radians(FIELD_OF_VIEW / 2)) / np.tan(np.radians(WIDE_FIELD_OF_VIEW / 2)) * middle
-    corner = (middle - half, middle - half)
-    axis.add_patch(Rectangle(corner, 2 * half, 2 * half, facecolor="none", edgecolor=RING, linewidth=1))
+    shown, whole = np.tan(np.radians([FIELD_OF_VIEW / 2, WIDE_FIELD_OF_VIEW / 2]))
+    side = options.resolution * shown / whole
+    corner = (options.resolution - side) / 2
+    axis.add_patch(Rectangle((corner, corner), side, side, facecolor="none", edgecolor=RING, linewidth=1))
 
 
 def _stripes(sensor: mi.Sensor, count: int) -> mi.Emitter:
     """Environment of dark and light bands, at right angles to an axis parallel to the image plane."""
     height = (np.arange(STRIPE_PIXELS) + 0.5) / STRIPE_PIXELS
     bands = np.where(np.floor(height * count) % 2 == 0, LIGHT, DARK)[:, None, None] * np.ones((1, 4, 3))
-    # The poles of an environment map lie on its y axis.
-    x, y, z = staging.camera_matrix(sensor)[:3, :3].T
+    x, y, z = staging.camera_matrix(sensor)[:3, :3].T  # The poles of an environment map lie on its y axis
     cos, sin = np.cos(np.radians(AXIS_ANGLE)), np.sin(np.radians(AXIS_ANGLE))
     turn = np.eye(4)
     turn[:3, :3] = np.stack([sin * x - cos * y, cos * x + sin * y, z], axis=1)

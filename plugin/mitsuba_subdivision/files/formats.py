@@ -9,7 +9,9 @@ import errno
 import importlib
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import KW_ONLY, dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,39 +20,45 @@ from ..cage.contents import CageContents
 from ..cage.errors import CageError, warn
 from ..mesh.connectivity import IntArray
 
-if TYPE_CHECKING:
-    from pathlib import Path
 
+@dataclass(frozen=True)
+class Format:
+    """Functions that read and write files of one format, and how its files differ from others.
 
-class Format(NamedTuple):
-    """Functions that read and write files of one format.
-
-    Each is named "module:function", as entry points of Python packages are, with a module of this package. The module
-    is imported when the function is first used.
+    Functions are named "module:function", with a module of this package that is imported when it is first used.
     """
 
     # From a path to `CageContents`. If the format has prims, it also takes `prim`, `time` and the rules that replace
     # the file's own, as `ControlCage.from_file` does.
     read: str
     write: str = ""  # Takes `CageContents` and a path; empty if there is none
-    write_triangles: str = ""  # Has the parameters of `write_triangles`, none with a default
+    write_triangles: str = ""  # Takes a path and `Triangles`; empty if there is none
+    _: KW_ONLY
     has_prims: bool = False  # Whether a file may hold several meshes, and values at several times
-    refers_to_files: bool = False  # Whether what a file says may depend on other files
-    # Axis, "y" or "z", that points up in the files that modelling programs write by default; None if files store it
-    up: str | None = "y"
+    refers_to_files: bool = False  # Whether other files may change the contents of a file
+    up: str | None = "y"  # Upward axis, "y" or "z", of modelling programs' files by default; None if files store it
 
 
-_USD = Format("usd_reader:read_usd", "usd_writer:write_usd", "usd_writer:write_usd_triangles", True, True, up=None)
-# Formats by suffix. OBJ files of Blender, Maya and Houdini have y up, PLY files of Blender z.
+_USDZ = Format("usd_reader:read_usd", has_prims=True, refers_to_files=True, up=None)
+_USD = replace(_USDZ, write="usd_writer:write_usd", write_triangles="usd_writer:write_usd_triangles")
+# Formats by suffix. OBJ files of Blender, Maya and Houdini have y up, PLY files of Blender z. An archive, ".usdz", can
+# be read but not written.
 FORMATS = {
     ".obj": Format("obj:read_obj", "obj:write_obj", "obj:write_obj_triangles"),
     ".ply": Format("ply:read_ply", "ply:write_ply", "ply:write_ply_triangles", up="z"),
-    ".usd": _USD,
-    ".usda": _USD,
-    ".usdc": _USD,
-    # An archive of finished USD files, which can be read but not written.
-    ".usdz": Format(_USD.read, has_prims=True, refers_to_files=True, up=None),
+    **dict.fromkeys((".usd", ".usda", ".usdc"), _USD),
+    ".usdz": _USDZ,
 }
+
+
+class Triangles(NamedTuple):
+    """Triangles on a limit surface, and the data at their vertices."""
+
+    positions: NDArray  # (n, 3) float32 or float64
+    normals: NDArray  # The same
+    triangles: NDArray  # (m, 3) int: 0-based rows of the other arrays
+    texcoords: NDArray | None  # (n, 2)
+    attributes: Mapping[str, NDArray]  # (n, k) each
 
 
 def read_file(path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str]) -> CageContents:
@@ -87,36 +95,30 @@ def require_triangle_format(path: str | Path) -> str:
 
 
 def write_triangles(
-    # `.obj`, with every digit; `.ply`, binary and in single precision; or `.usd`, `.usda` or `.usdc`, in single
-    # precision, as a mesh that is not to be subdivided
     path: str | Path,
-    positions: NDArray,  # (n, 3) float32 or float64
-    normals: NDArray,  # The same
-    triangles: NDArray,  # (m, 3) int: 0-based rows of positions, normals, texture coordinates and attributes
-    texcoords: NDArray | None = None,  # (n, 2)
-    attributes: Mapping[str, NDArray] | None = None,  # (n, k) each
+    positions: NDArray,
+    normals: NDArray,
+    triangles: NDArray,
+    texcoords: NDArray | None = None,
+    attributes: Mapping[str, NDArray] | None = None,
 ) -> None:
-    """Write triangles on a limit surface and the data at their vertices; see `Tessellation.save`."""
+    """Write `Triangles`; see `Tessellation.save`."""
     write = function_named(FORMATS[require_triangle_format(path)].write_triangles)
-    write(path, positions, normals, triangles, texcoords, attributes or {})
+    write(path, Triangles(positions, normals, triangles, texcoords, attributes or {}))
 
 
 def faces_by_name(names: Sequence[str], number: IntArray) -> dict[str, IntArray]:
-    """Faces of each name that any face has, by the index ``(n_f,)`` of each one's name; names may be repeated."""
+    """Faces by name, from the index ``(n_f,)`` of each face's name; names may be repeated."""
     index = {name: i for i, name in enumerate(dict.fromkeys(names))}
     number = np.array([index[name] for name in names])[number]
     ends = np.cumsum(np.bincount(number, minlength=len(index)))
     faces = np.split(np.argsort(number, kind="stable"), ends[:-1])
-    return {name: of_name for name, of_name in zip(index, faces, strict=True) if len(of_name)}
+    return {name: its_faces for name, its_faces in zip(index, faces, strict=True) if len(its_faces)}
 
 
-def warn_of_losses(
-    path: str | Path,
-    parts: Mapping[str, bool],  # Names of parts, and whether each is lost
-) -> None:
-    """Warn of the parts of a cage that a file of this format cannot hold."""
-    lost = [name for name, is_lost in parts.items() if is_lost]
-    if lost:
+def warn_of_losses(path: str | Path, parts: Mapping[str, bool]) -> None:
+    """Warn of the parts of a cage, by their names, that are lost in a file of this format."""
+    if lost := [name for name, is_lost in parts.items() if is_lost]:
         suffix = os.path.splitext(path)[1]
         warn(f'"{path}": {suffix} files have no place for {", ".join(lost)} of the cage; written without them')
 

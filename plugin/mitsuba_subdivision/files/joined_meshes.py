@@ -14,22 +14,12 @@ from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 
 Value = TypeVar("Value")
-# Arrays of a cage whose rows are those parts of a mesh.
-_PARTS = {
-    "vertices": "positions",
-    "faces": "face_sizes",
-    "creases": "creases",
-    "corners": "corners",
-    "holes": "holes",
-}
+# Parts of a mesh, and an array with a row for each.
+_PARTS = {"vertices": "positions", "faces": "face_sizes", "creases": "creases", "corners": "corners", "holes": "holes"}
 
 
-def joined(
-    # One or more, with the same rules by name; values and indices are checked. A single mesh is returned as it is.
-    meshes: Sequence[CageContents],
-    name: str,  # Of the file in messages
-) -> CageContents:
-    """Contents of one cage with the vertices and faces of all meshes, one mesh after the other.
+def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
+    """Join meshes with valid indices to one cage; messages begin with the name of their file.
 
     Texture coordinates and attributes are kept if all meshes have them, with the same interpolation and width, else
     there is a warning. Meshes of different rules or schemes are an error.
@@ -63,18 +53,15 @@ def joined(
 
 
 def _common(rule: str, meshes: Sequence[CageContents], values: Sequence[Value]) -> Value:
-    """The value of a rule, which must be the same in all meshes."""
     for mesh, value in zip(meshes, values, strict=True):
         if value != values[0]:
-            raise CageError(
-                f'{mesh.source.name}: {rule} is "{value}", but "{values[0]}" in the mesh {_prim(meshes[0].source)}; '
-                f"expected the same in all meshes, or {rule} as an argument"
-            )
+            found = f'{rule} is "{value}", but "{values[0]}" in the mesh {_prim(meshes[0].source)}'
+            expected = f"expected the same in all meshes, or {rule} as an argument"
+            raise CageError(f"{mesh.source.name}: {found}; {expected}")
     return values[0]
 
 
 def _joined_data(meshes: Sequence[CageContents], name: str) -> tuple[Attribute | None, dict[str, Attribute]]:
-    """Texture coordinates and attributes that all meshes have."""
     texcoords = _joined_attribute([mesh.texcoords for mesh in meshes])
     names = dict.fromkeys(attribute for mesh in meshes for attribute in mesh.attributes)
     joined = {attribute: _joined_attribute([mesh.attributes.get(attribute) for mesh in meshes]) for attribute in names}
@@ -134,11 +121,9 @@ class _JoinedSource(CageSource):
         return ", ".join(f"{mesh.faces(np.array([number]))} of {_prim(mesh)}" for mesh, number in places) + more
 
     def _in_mesh(self, part: str, index: int) -> tuple[CageSource, int]:
-        """Source of the mesh to which a part belongs, and its number there."""
         mesh = int(np.searchsorted(self.starts[part], index, side="right")) - 1
         return self.meshes[mesh], int(index) - int(self.starts[part][mesh])
 
 
 def _prim(mesh: CageSource) -> str:
-    """Path of a mesh in its file."""
     return mesh.name.rpartition(", prim ")[2]

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +20,8 @@ from ..cage.contents import RULES, Attribute, CageContents
 from ..cage.errors import CageError, CageSource, shortened, warn
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from .formats import faces_by_name, warn_of_losses
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from ..whole_file import whole_file
+from .formats import Triangles, faces_by_name, warn_of_losses
 
 # Rows that are turned into text at once, which bounds the memory for numbers as Python objects.
 ROWS = 1 << 16
@@ -66,9 +65,8 @@ _PROPAGATE = "facevaryingpropagatecorners"
 def read_obj(path: str | Path) -> CageContents:
     """Read vertices, faces, texture coordinates, materials and OpenSubdiv's tags of a Wavefront OBJ file.
 
-    Further columns of ``v`` and ``vt`` must be numbers and are dropped; the v of a texture coordinate is 0 if it is
-    missing. Faces before the first ``usemtl`` have the material "". All other statements are skipped. Where only some
-    corners have texture coordinates, or there are no ``vt``, as in files of OpenSubdiv, the cage has none.
+    Further columns of ``v`` and ``vt`` must be numbers and are dropped; a missing v of a texture coordinate is 0. Faces
+    before the first ``usemtl`` have the material "". If only some corners have texture coordinates, the cage has none.
     """
     with open(path, "rb") as file:
         obj = _ObjText.split(f'"{path}"', file.read())
@@ -82,12 +80,11 @@ def read_obj(path: str | Path) -> CageContents:
     texcoords, _ = _read_numbers(obj, is_texcoord, "vt", "texture coordinates", 2, 1)
     sizes = obj.require_arguments(is_face, "face corners", 3)
     corners, first = obj.arguments(is_face)
-    indices = _corner_indices(corners, int(sizes.sum()))
-    if indices is None:
+    if (indices := _corner_indices(corners, int(sizes.sum()))) is None:
         raise obj.malformed(corners, first, _CORNER, "integers as v, v/vt, v//vn or v/vt/vn")
 
     def zero_based(indices: IntArray, counted: NDArray[np.bool_], nouns: tuple[str, str], rows: NDArray) -> IntArray:
-        """0-based indices of the face corners ``rows`` from those that are written, which count statements."""
+        """0-based indices of the face corners ``rows``; the file counts statements."""
         count = int(counted.sum())
         if indices.min() > 0 and indices.max() <= count:
             return indices - 1
@@ -107,10 +104,8 @@ def read_obj(path: str | Path) -> CageContents:
     vertices = zero_based(vertices, is_vertex, ("vertex", "vertices"), np.arange(len(vertices)))
     texture = None
     if len(with_texcoord) and not len(texcoords):
-        warn(
-            f'{obj.name}: faces have texture coordinate indices, but there are no texture coordinates ("vt" '
-            "statements); the cage is read without them"
-        )
+        lacking = 'there are no texture coordinates ("vt" statements)'
+        warn(f"{obj.name}: faces have texture coordinate indices, but {lacking}; the cage is read without them")
     elif len(with_texcoord):
         nouns = "texture coordinate", "texture coordinates"
         texcoord_indices = zero_based(texcoord_indices, is_texcoord, nouns, with_texcoord)
@@ -119,10 +114,9 @@ def read_obj(path: str | Path) -> CageContents:
         if is_without.any():
             faces = np.unique(np.repeat(np.arange(len(sizes)), sizes)[is_without])
             line = obj.lines(obj.statement_start[is_face][faces[0]])
-            warn(
-                f"{obj.name}: {len(faces)} of {len(sizes)} faces have corners without texture coordinates, the first "
-                f"in line {line}; the cage is read without any (expected them at all corners)"
-            )
+            without = f"{len(faces)} of {len(sizes)} faces have corners without texture coordinates"
+            where = f"the first in line {line}; the cage is read without any (expected them at all corners)"
+            warn(f"{obj.name}: {without}, {where}")
         else:
             texture = Attribute(texcoords, "face_varying", texcoord_indices)
     lines = obj.lines(obj.statement_start)
@@ -139,7 +133,6 @@ def read_obj(path: str | Path) -> CageContents:
 
 
 def _materials(obj: _ObjText, is_face: NDArray[np.bool_]) -> dict[str, IntArray]:
-    """Faces of each material that the file names."""
     if b"usemtl" not in obj.text:
         return {}
     used = list(re.finditer(rb"^[ \t]*usemtl\b(.*)$", obj.text, re.MULTILINE))
@@ -156,8 +149,7 @@ def _read_numbers(
     if not len(counts):
         return np.zeros((0, columns)), counts
     text, start = obj.arguments(chosen, len(keyword))
-    values = _parsed(text, np.float64, counts.sum())
-    if values is None:
+    if (values := _parsed(text, np.float64, counts.sum())) is None:
         raise obj.malformed(text, start, _NUMBER, "a decimal number")
     if (counts == columns).all():
         return values.reshape(-1, columns), counts
@@ -179,8 +171,7 @@ def _corner_indices(text: NDArray[np.uint8], corner_count: int) -> tuple[IntArra
     numbers = text.copy()
     numbers[slash] = _SPACE
     number_start = _run_starts(numbers != _SPACE)
-    values = _parsed(numbers, np.int64, len(number_start))
-    if values is None:
+    if (values := _parsed(numbers, np.int64, len(number_start))) is None:
         return None
     # A texture coordinate follows a corner's first slash, unless another slash does.
     with_texcoord = corner[(np.diff(corner, prepend=-1) != 0) & (text[slash + 1] != _SLASH)]
@@ -213,10 +204,8 @@ def _read_tags(obj: _ObjText) -> tuple[dict[str, Any], dict[str, list[int]]]:
         else:
             warn(f'{where}: tag "{shortened(tag.strip())}" is not supported and has no effect')
     if propagates and rules.get("face_varying", "corners_plus1") not in ("corners_plus1", "corners_plus2"):
-        warn(
-            f'{propagates}: tag "{_PROPAGATE}" has no effect with the face-varying rule "{rules["face_varying"]}"; '
-            'expected it with "corners_plus1"'
-        )
+        other = f'the face-varying rule "{rules["face_varying"]}"; expected it with "corners_plus1"'
+        warn(f'{propagates}: tag "{_PROPAGATE}" has no effect with {other}')
     elif propagates:
         rules["face_varying"] = "corners_plus2"
     tags: dict[str, Any] = {"rules": rules}
@@ -227,7 +216,6 @@ def _read_tags(obj: _ObjText) -> tuple[dict[str, Any], dict[str, list[int]]]:
 
 
 def _values(where: str, tag: str) -> tuple[str, list[int], list[float], list[str]]:
-    """Name, integers, floats and strings of a tag."""
     problem = ""
     try:
         if head := _HEAD.match(tag):
@@ -252,7 +240,7 @@ def _integer(text: str) -> int:
 
 
 def _listed(where: str, name: str, integers: list[int], floats: list[float]) -> list[list[float]]:
-    """Rows of the vertices or the face, and of the sharpness, of which there may be one for all rows."""
+    """Rows of vertices or a face, each with its sharpness, which may be one for all."""
     width, has_sharpness, expected = _LIST_TAGS[name]
     count = len(integers) // width
     if not count or len(integers) % width or len(floats) not in ((1, count) if has_sharpness else (0,)):
@@ -266,23 +254,21 @@ def _listed(where: str, name: str, integers: list[int], floats: list[float]) -> 
 def _rule(where: str, tag: str, name: str, given: list[Any]) -> dict[str, str]:
     """The rule that a tag sets; nothing, with a warning, for an unknown value."""
     rule, values = RULE_TAGS[name]
-    kind, shown = type(next(iter(values))), shortened(tag.strip())
+    kind, shown = type(next(iter(values))), f'tag "{shortened(tag.strip())}"'
     if len(given) != 1 or not isinstance(given[0], kind):
         noun = "string" if kind is str else "integer"
-        raise CageError(f'{where}: tag "{shown}" has the wrong values; expected one {noun}')
+        raise CageError(f"{where}: {shown} has the wrong values; expected one {noun}")
     if given[0] in values:
         return {rule: values[given[0]]}
-    expected = ", ".join(map(str, values))
-    warn(f'{where}: tag "{shown}" has an unknown value and no effect; expected one of {expected}')
+    warn(f"{where}: {shown} has an unknown value and no effect; expected one of {', '.join(map(str, values))}")
     return {}
 
 
 @dataclass(frozen=True, eq=False)
 class _ObjText:
-    """Bytes of an OBJ file, split into statements, which are its lines that are not empty.
+    """Bytes of an OBJ file, split into statements, the lines that are not empty.
 
-    Comments and line continuations are overwritten by spaces and never removed, so that the position of a byte always
-    gives its line in the file.
+    Comments and line continuations are overwritten by spaces, so that the position of a byte gives its line.
     """
 
     name: str
@@ -326,7 +312,6 @@ class _ObjText:
         return cls(name, text, line_end, starts, counts[counts > 0] - 1, not content.endswith(b"\n"))
 
     def lines(self, positions: IntArray | int) -> IntArray:
-        """1-based line of each byte position."""
         return np.searchsorted(self.line_end, positions) + 1
 
     def statements_of(self, keyword: bytes) -> NDArray[np.bool_]:
@@ -338,10 +323,7 @@ class _ObjText:
         return same
 
     def arguments(self, chosen: NDArray[np.bool_], keyword_length: int = 1) -> tuple[NDArray[np.uint8], int]:
-        """Arguments of one or more statements, and the position of the first in the file.
-
-        They are the bytes from the first to the last of these statements, where all else is spaces.
-        """
+        """Bytes from the first to the last statement, with spaces around arguments, and their position in the file."""
         numbers = np.flatnonzero(chosen)
         bounds = np.append(self.statement_start, len(self.text))[numbers[0] : numbers[-1] + 2]
         # Control characters count as spaces.
@@ -367,7 +349,6 @@ class _ObjText:
         return CageError(f"{self.name}: malformed numbers; expected {expected}")
 
     def error(self, position: int, message: str) -> CageError:
-        """An error that names the line of a byte position."""
         cut = " (the file ends here without a newline: is it cut short?)"
         is_last = self.is_cut and position >= self.statement_start[-1]
         return CageError(f"{self.name}, line {self.lines(position)}: {message}{cut if is_last else ''}")
@@ -386,14 +367,13 @@ def _parsed(text: NDArray[np.uint8], dtype: type[np.generic], count: int) -> NDA
 
 
 def _run_starts(inside: NDArray[np.bool_]) -> IntArray:
-    """Positions at which runs of true begin."""
     begins = inside.copy()
     np.greater(inside[1:], inside[:-1], out=begins[1:])
     return np.flatnonzero(begins)
 
 
 def _without_comment(match: re.Match[bytes]) -> bytes:
-    """What comes in place of a comment, or of the name of a material from its first "#" on: most of all, spaces."""
+    """Spaces in place of a comment; in place of a material's name from its first "#" on, what belongs to the name."""
     text, (start, end) = match.string, match.span()
     line = text[text.rfind(b"\n", 0, start) + 1 : end]
     kept = _COMMENT_OF_NAME.split(line)[0] if _MATERIAL.match(line) else b""
@@ -401,10 +381,9 @@ def _without_comment(match: re.Match[bytes]) -> bytes:
 
 
 def write_obj(contents: CageContents, path: str | Path) -> None:
-    """Write a cage to an OBJ file, with creases, corners, holes and rules as OpenSubdiv's tags.
+    """Write a cage to an OBJ file with all digits of its numbers, and with OpenSubdiv's tags.
 
-    Numbers have all digits that distinguish float64 numbers. Of materials, names that are not one line of text are
-    lost, and all but one of a face.
+    Names of materials that are not one line of text are lost, and all but one material of a face.
     """
     texcoords, owner = contents.texcoords, contents.material_of_face
     if texcoords is not None and texcoords.interpolation != "face_varying":
@@ -435,8 +414,6 @@ def write_obj(contents: CageContents, path: str | Path) -> None:
     of_face = np.array(names, dtype=object)[owner]
     for face in np.flatnonzero(of_face != np.append([""], of_face[:-1])):
         faces[face] = f"usemtl {of_face[face]}\n{faces[face]}"
-    from ..whole_file import whole_file  # Not above: reading does not need it.
-
     with whole_file(path) as beside, beside.open("w", encoding="utf-8", newline="\n") as stream:
         stream.write(f"# {len(contents.positions)} vertices, {len(faces)} faces\n")
         stream.writelines(_number_statements("v", np.asarray(contents.positions, np.float64)))
@@ -446,18 +423,10 @@ def write_obj(contents: CageContents, path: str | Path) -> None:
         stream.write(_tag_statements(contents))
 
 
-def write_obj_triangles(
-    path: str | Path,
-    positions: NDArray,
-    normals: NDArray,
-    triangles: NDArray,
-    texcoords: NDArray | None,
-    attributes: Mapping[str, NDArray],
-) -> None:
-    """Write triangles to an OBJ file, with all digits of their type; see `formats.write_triangles`."""
+def write_obj_triangles(path: str | Path, surface: Triangles) -> None:
+    """Write triangles to an OBJ file, with all digits of their type."""
+    positions, normals, triangles, texcoords, attributes = surface
     warn_of_losses(path, {f'attribute "{name}"': True for name in attributes})
-    from ..whole_file import whole_file
-
     with whole_file(path) as beside, beside.open("w", encoding="ascii", newline="\n") as stream:
         stream.write(f"# {len(positions)} vertices, {len(triangles)} triangles\n")
         for keyword, values in (("v", positions), ("vt", texcoords), ("vn", normals)):
@@ -485,7 +454,6 @@ def _number_statements(keyword: str, values: NDArray) -> Iterator[str]:
 
 
 def _tag_statements(contents: CageContents) -> str:
-    """Statements of creases, corners and holes, and of rules other than the default."""
     creases, corners = contents.creases.tolist(), contents.corners.tolist()
     lines = [f"t crease 2/1/0 {start:.0f} {end:.0f} {sharpness!r}\n" for start, end, sharpness in creases]
     lines += [f"t corner 1/1/0 {vertex:.0f} {sharpness!r}\n" for vertex, sharpness in corners]

@@ -20,7 +20,7 @@ from ..cage.errors import CageError, CageSource, shortened, warn
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..whole_file import whole_file
-from .formats import faces_by_name, warn_of_losses
+from .formats import Triangles, faces_by_name, warn_of_losses
 
 if TYPE_CHECKING:
     from plyfile import PlyData, PlyElement
@@ -43,9 +43,9 @@ _TYPES = {np.dtype("<f8"): "double", np.dtype("<f4"): "float", np.dtype("<i4"): 
 def read_ply(path: str | Path) -> CageContents:
     """Read polygons, data at vertices and materials of faces of a PLY file, ASCII or binary.
 
-    Polygons are the list ``vertex_indices`` or ``vertex_index`` of the element ``face``. Normals are dropped, as those
-    of the surface follow from its points. Of the properties of vertices, `_TEXCOORDS` name texture coordinates, and
-    `grouped` makes attributes of all others; unsigned integers of colours are scaled to 0 to 1.
+    Polygons are the list ``vertex_indices`` or ``vertex_index`` of the element ``face``. Normals are dropped: they
+    follow from the surface. Properties of vertices become texture coordinates by `_TEXCOORDS`, or attributes by
+    `grouped`; unsigned integers of colours are scaled to 0 to 1.
     """
     name, content = f'"{path}"', Path(path).read_bytes()
     header = content[: max(0, content.find(b"end_header"))]
@@ -58,8 +58,7 @@ def read_ply(path: str | Path) -> CageContents:
             rows = shortened(f"{digits.decode()} rows of {word.decode('ascii', 'replace')}", 200)
             raise CageError(f"{name}: {rows} do not fit into the file; expected fewer")
         if not binary:
-            # A row is a line.
-            lines[word.decode("ascii", "replace")] = first + np.arange(int(digits))
+            lines[word.decode("ascii", "replace")] = first + np.arange(int(digits))  # A row is a line
             first += int(digits)
     # When the cage is validated, numbers that are not finite become errors that name their place.
     with np.errstate(over="ignore", invalid="ignore"):
@@ -117,17 +116,14 @@ def _contents(elements: PlyData, name: str, lines: dict[str, IntArray]) -> CageC
     of_faces, lists_of_faces = _properties(face)
     polygons = next((known for known in _FACE_LISTS if known in lists_of_faces), None)
     if polygons is None:
-        raise CageError(
-            f'{name}: the element "face" has no property "vertex_indices" or "vertex_index"; expected one, a list of '
-            f"integers, among {_listed([*of_faces, *lists_of_faces])}"
-        )
+        expected = f"expected one, a list of integers, among {_listed([*of_faces, *lists_of_faces])}"
+        raise CageError(f'{name}: the element "face" has no property "vertex_indices" or "vertex_index"; {expected}')
     owner = next((known for known in _MATERIAL if known in of_faces and face.data[known].dtype.kind in "iu"), None)
     left_out = [f'"{other}" of faces' for other in face.data.dtype.names if other not in (polygons, owner)]
     left_out += [f'the list "{other}" of vertices' for other in lists]
     if left_out:
         warn(f"{name}: {_listed(left_out)} left out; expected numbers at vertices")
-    # Each face is a row of a table or an array of its own.
-    table = face.data[polygons]
+    table = face.data[polygons]  # Each face is a row of a table or an array of its own
     sizes = np.full(len(table), table.shape[1]) if table.ndim == 2 else np.array([len(row) for row in table])
     vertices = table.astype(table.dtype.newbyteorder("=")).ravel() if table.ndim == 2 else np.concatenate(list(table))
     if vertices.dtype.kind not in "iu":
@@ -145,7 +141,7 @@ def _contents(elements: PlyData, name: str, lines: dict[str, IntArray]) -> CageC
 
 
 def _properties(element: PlyElement) -> tuple[list[str], list[str]]:
-    """Names of an element's properties that are numbers, and of those that are lists."""
+    """Names of an element's properties that are numbers, and names of its lists."""
     lists = [known.name for known in element.properties if hasattr(known, "len_dtype")]
     return [known.name for known in element.properties if known.name not in lists], lists
 
@@ -155,7 +151,6 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _materials(numbers: NDArray) -> dict[str, IntArray]:
-    """Faces of each material, by its name."""
     distinct, index = np.unique(np.maximum(np.asarray(numbers).astype(np.int64), -1), return_inverse=True)
     return faces_by_name(["" if number < 0 else f"material_{number}" for number in distinct.tolist()], index.ravel())
 
@@ -174,13 +169,10 @@ def _vertex_data(data: NDArray, numbers: Sequence[str]) -> tuple[Attribute | Non
 
 
 def _columns(data: NDArray, names: Sequence[str], scaled: bool = False) -> NDArray[np.float64]:
-    """Table of some properties as float64; if ``scaled``, the range of unsigned integers becomes 0 to 1."""
-    columns = []
-    for name in names:
-        column = data[name]
-        highest = np.iinfo(column.dtype).max if scaled and column.dtype.kind == "u" else 1
-        columns.append(column.astype(np.float64) / highest)
-    return np.stack(columns, axis=1)
+    """Table of properties as float64; if ``scaled``, the range of unsigned integers becomes 0 to 1."""
+    columns = [data[name] for name in names]
+    highest = [np.iinfo(column.dtype).max if scaled and column.dtype.kind == "u" else 1 for column in columns]
+    return np.stack([column.astype(np.float64) for column in columns], axis=1) / highest
 
 
 def _color_of(names: Sequence[str]) -> tuple[str, ...]:
@@ -221,7 +213,7 @@ def grouped(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
 def write_ply(contents: CageContents, path: str | Path) -> None:
     """Write the polygons of a cage, their materials, and its data at vertices, to a PLY file in double precision.
 
-    Of materials, names other than "material_0" and so on are lost, and all but one of a face.
+    Names of materials other than "material_0" and so on are lost, and all but one material of a face.
     """
     texcoords = contents.texcoords
     if texcoords is not None and texcoords.interpolation != "vertex":
@@ -262,15 +254,9 @@ def write_ply(contents: CageContents, path: str | Path) -> None:
     write_polygons(path, properties, contents.face_sizes, contents.face_vertices, materials)
 
 
-def write_ply_triangles(
-    path: str | Path,
-    positions: NDArray,
-    normals: NDArray,
-    triangles: NDArray,
-    texcoords: NDArray | None,
-    attributes: Mapping[str, NDArray],
-) -> None:
-    """Write triangles to a PLY file in single precision; see `formats.write_triangles`."""
+def write_ply_triangles(path: str | Path, surface: Triangles) -> None:
+    """Write triangles to a binary PLY file in single precision."""
+    positions, normals, triangles, texcoords, attributes = surface
     possible = {name: value for name, value in attributes.items() if is_possible(name)}
     warn_of_losses(path, {f'attribute "{name}"': name not in possible for name in attributes})
     properties = dict(zip((*_POSITION, *_NORMAL), [*positions.T, *normals.T], strict=True))
@@ -286,7 +272,6 @@ def is_possible(name: str) -> bool:
 
 
 def _columns_of(attributes: Mapping[str, NDArray]) -> dict[str, NDArray]:
-    """Columns of attributes ``(n, k)``, by the names of their properties."""
     columns: dict[str, NDArray] = {}
     for name, values in attributes.items():
         width, names = values.shape[1], [name]
@@ -300,9 +285,9 @@ def _columns_of(attributes: Mapping[str, NDArray]) -> dict[str, NDArray]:
 
 def write_polygons(
     path: str | Path,
-    properties: Mapping[str, NDArray],  # dict of str to (n,) float32 or float64 array: properties of vertices by name
-    face_sizes: NDArray,  # (n_f,) int
-    face_vertices: NDArray,  # (sum of face_sizes,) int: 0-based
+    properties: Mapping[str, NDArray],  # (n,) float32 or float64 each: numbers of vertices by name
+    face_sizes: NDArray,
+    face_vertices: NDArray,
     materials: NDArray | None = None,  # (n_f,) int: number of each face's material; negative for none
 ) -> None:
     """Write polygons to a binary PLY file, whole or not at all."""
@@ -321,7 +306,7 @@ def write_polygons(
         *([] if materials is None else [f"property int {_MATERIAL[0]}"]),
         "end_header\n",
     ]
-    # Of each face its size, followed by its vertices and its material.
+    # Each face is its size, followed by its vertices and its material.
     sizes, numbers = face_sizes.astype(size_type), face_vertices.astype("<i4")
     if materials is not None:
         numbers = np.insert(numbers, np.cumsum(face_sizes, dtype=np.int64), materials)

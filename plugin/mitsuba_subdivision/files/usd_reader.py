@@ -6,20 +6,15 @@ import math
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import cached_property, partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..cage import validation
 from ..cage.contents import RULES, Attribute, CageContents, validated_attribute
 from ..cage.errors import CageError, CageSource, number_of_such, shortened, warn
-from ..cage.validation import (
-    require_range,
-    require_sharpness,
-    require_vertices,
-    validated_face_indices,
-    validated_positions,
-)
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from . import usd_stage
@@ -28,8 +23,6 @@ from .usd_skinning import Skinning
 from .usd_stage import FLAT_SCHEMES, INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, time_of, value_at
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from pxr import Usd, UsdGeom
 
 Read = TypeVar("Read")
@@ -44,8 +37,8 @@ def read_usd(
     """Read a mesh of a USD file, or all meshes, with subdivision attributes and primvars, in world space.
 
     ``prim`` and ``time`` are those of `ControlCage.from_file`, and so are errors and warnings; the cage itself is not
-    validated. The orientation of faces is reversed in left-handed meshes and in those that their transform mirrors, so
-    that faces are counter-clockwise from outside. Skeletons and blend shapes move the points, as usd-core does.
+    validated. Faces of left-handed and of mirrored meshes are reversed, so that they are counter-clockwise from
+    outside. Skeletons and blend shapes move the points, as usd-core does.
     """
     name = f'"{path}"'
     if time is not None and not math.isfinite(time):
@@ -73,10 +66,9 @@ class MeshReader:
         self,
         mesh: UsdGeom.Mesh,
         location: str,  # Beginning of messages
-        skinning: Skinning,  # Of the stage, at the time at which the mesh is read
+        skinning: Skinning,  # Has the time at which the mesh is read
         rules: Mapping[str, str] | None = None,  # As for `read_usd`
-        # Gets messages about attributes that do not fit the mesh, which are then left out, and their paths.
-        # By default, these are errors.
+        # Gets messages about attributes that are left out, and their paths; by default, these are errors
         report: Callable[[str, object], None] | None = None,
     ) -> None:
         self.mesh, self.location, self.skinning = mesh, location, skinning
@@ -85,9 +77,9 @@ class MeshReader:
     def contents(self, attributes: Collection[str] | None = None, texcoords: str | None = None) -> CageContents:
         """The mesh as contents of a cage in the world's space, with all primvars.
 
-        With names of attributes, the mesh is in its own space, where one that is not to be smoothed has no scheme, and
-        only these primvars and texture coordinates are read, values of whole faces as those of their corners. Texture
-        coordinates are looked up by the name ``texcoords`` first.
+        With names of attributes, the mesh is in its own space, without a scheme if it is flat, and only these primvars
+        and texture coordinates are read, values of whole faces as those of their corners. The primvar ``texcoords`` is
+        preferred for texture coordinates.
         """
         mesh, is_local = self.mesh, attributes is not None
         points = self.array(mesh.GetPointsAttr(), np.float64, required=True, width=3)
@@ -105,8 +97,8 @@ class MeshReader:
             vertices = vertices[order]
         if not np.array_equal(matrix, np.eye(4)):
             points = points @ matrix[:3, :3] + matrix[3, :3]
-        points = validated_positions(points, self._source)
-        require_vertices(len(points), sizes, vertices, self._source)
+        points = validation.validated_positions(points, self._source)
+        validation.require_vertices(len(points), sizes, vertices, self._source)
         topology = Topology(len(points), sizes, vertices)
 
         def tags(noun: str, read: Callable[[Topology], NDArray], otherwise: NDArray) -> NDArray:
@@ -115,7 +107,7 @@ class MeshReader:
 
         def holes(topology: Topology) -> IntArray:
             faces = self.array(mesh.GetHoleIndicesAttr(), np.int64)
-            return validated_face_indices(topology, faces, "hole", self._source)
+            return validation.validated_face_indices(topology, faces, "hole", self._source)
 
         rules = {rule: self._rule(rule) for rule in RULE_ATTRIBUTES if rule not in self._rules}
         is_flat = str(self.value(mesh.GetSubdivisionSchemeAttr())) in FLAT_SCHEMES
@@ -136,9 +128,9 @@ class MeshReader:
         )
 
     def fitting(self, attribute: Usd.Attribute, consequence: str, read: Callable[[], Read], otherwise: Read) -> Read:
-        """What a function reads of an attribute; something else, with a report, where that does not fit the mesh.
+        """Read an attribute; if it does not fit the mesh, report the consequence, and return ``otherwise``.
 
-        The report ends with the consequence: "the creases are left out". If nothing takes reports, it is an error.
+        Without a function for reports, it is an error.
         """
         try:
             return read()
@@ -159,7 +151,6 @@ class MeshReader:
         return CageError(f"{self.location}: {problem}; expected {expected}")
 
     def value(self, attribute: Usd.Attribute) -> Any:
-        """Value of an attribute; see `read_usd` for its time."""
         return attribute.Get(self._time_of(attribute))
 
     def _time_of(self, attribute: Usd.Attribute) -> Usd.TimeCode:
@@ -198,7 +189,7 @@ class MeshReader:
         return array.astype(kind)
 
     def _token(self, attribute: Usd.Attribute, known: Sequence[str]) -> str:
-        """Value of an attribute that must be one of the known ones, of which the first is the schema's fallback."""
+        """Value of an attribute among known ones; the first is the schema's fallback."""
 
         def read() -> str:
             value = str(self.value(attribute))
@@ -213,13 +204,11 @@ class MeshReader:
         return self._token(self.mesh.GetOrientationAttr(), ("rightHanded", "leftHanded")) == "leftHanded"
 
     def _rule(self, rule: str) -> str:
-        """Value of a rule, as `RULES` names it."""
         attribute = self.mesh.GetPrim().GetAttribute(RULE_ATTRIBUTES[rule])
         value = self._token(attribute, [usd_stage.token(name) for name in RULES[rule]])
         return re.sub("([A-Z])", lambda match: f"_{match[1].lower()}", value)
 
     def _scheme(self) -> str:
-        """The mesh's scheme, or the one that replaces it."""
         given = self._rules.get("scheme")
         asked = self._token(self.mesh.GetSubdivisionSchemeAttr(), [*SCHEMES, *FLAT_SCHEMES])
         if given is None:
@@ -238,15 +227,13 @@ class MeshReader:
         indices = self.array(mesh.GetCreaseIndicesAttr(), np.int64)
         lengths = self.array(mesh.GetCreaseLengthsAttr(), np.int64)
         sharpness = self.array(mesh.GetCreaseSharpnessesAttr(), np.float64)
-        if not len(indices) and not len(lengths) and not len(sharpness):
-            return np.zeros((0, 3))
         for short in np.flatnonzero(lengths < 2)[:1]:
             raise self.error(f"creaseLengths has the value {lengths[short]} at {short}", "2 or more vertices")
         if lengths.sum() != len(indices):
             problem = f"creaseLengths add up to {lengths.sum()}, but creaseIndices has {len(indices)} entries"
             raise self.error(problem, "as many")
         edges = lengths - 1
-        require_sharpness(sharpness, lambda row: f"{self.location}: value {row} of creaseSharpnesses")
+        validation.require_sharpness(sharpness, lambda row: f"{self.location}: value {row} of creaseSharpnesses")
         if len(sharpness) == len(lengths):
             sharpness = np.repeat(sharpness, edges)
         elif len(sharpness) != edges.sum():
@@ -264,7 +251,7 @@ class MeshReader:
         if len(indices) != len(sharpness):
             problem = f"cornerSharpnesses has {len(sharpness)} entries, but cornerIndices has {len(indices)}"
             raise self.error(problem, "as many")
-        require_sharpness(sharpness, lambda row: f"{self.location}: value {row} of cornerSharpnesses")
+        validation.require_sharpness(sharpness, lambda row: f"{self.location}: value {row} of cornerSharpnesses")
         return self._rows_of_mesh(np.stack([indices, sharpness], axis=1), topology, "corner")
 
     def _rows_of_mesh(self, rows: NDArray[np.float64], topology: Topology, noun: str) -> NDArray[np.float64]:
@@ -280,7 +267,6 @@ class MeshReader:
         return rows[is_inside]
 
     def _local_to_world(self) -> NDArray[np.float64]:
-        """The transform to world space, as a matrix for row vectors."""
         matrix = np.array(usd_stage.local_to_world(self.mesh.GetPrim(), self._time_of))
         # The determinant says nothing about a matrix that is not finite.
         if not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) == 0:
@@ -290,17 +276,15 @@ class MeshReader:
 
     def _primvars(
         self,
-        # (n_h,) int64, if the orientation of faces is reversed: which face corner of the file becomes each face corner
-        order: IntArray | None,
+        order: IntArray | None,  # `reversed_order`, if the orientation of faces is reversed
         topology: Topology,
-        chosen: Collection[str] | None,  # As for `contents`
+        chosen: Collection[str] | None,
         first_name: str | None,
     ) -> tuple[Attribute | None, dict[str, Attribute]]:
-        """Texture coordinates and attributes.
+        """Texture coordinates and attributes, from primvars of floating-point numbers.
 
-        Primvars of floating-point numbers are read. The first of "st", "UVMap" and "texcoords" that there is gives the
-        texture coordinates, or else the first primvar of the type ``texCoord2``. Skipped without a warning are normals,
-        which follow from the surface, joints and their weights, and primvars with a single value for the whole mesh.
+        Texture coordinates are the first of "st", "UVMap" and "texcoords", or else of type ``texCoord2``. Constants,
+        joints and normals, which follow from the surface, are skipped without a warning.
         """
         from pxr import UsdGeom
 
@@ -324,18 +308,15 @@ class MeshReader:
             indexed = primvar.GetIndicesAttr() if primvar.IsIndexed() else None
             width = 2 if name == first_name else None
             read = partial(self._attribute, name, table, indexed, interpolation, order, topology, width)
-            values = self.fitting(attribute, "the primvar is left out", read, None)
-            if values is not None:
+            if (values := self.fitting(attribute, "the primvar is left out", read, None)) is not None:
                 attributes[name] = values
                 pairs += [name] if is_pair else []
         if left_out:
             shown = shortened(", ".join(left_out.values()), 200)
             message = f"{self.location}: primvars {shown} left out; expected floats, at vertices or face corners"
             self._tell(message, ", ".join(left_out))
-        pair_names = (
-            name for name in (*preferred, *pairs) if name in attributes and attributes[name].values.shape[1] == 2
-        )
-        first = next(pair_names, None)
+        known_pairs = [name for name, values in attributes.items() if values.values.shape[1] == 2]
+        first = next((name for name in (*preferred, *pairs) if name in known_pairs), None)
         texcoords = None if first is None else attributes[first]
         kept = attributes.keys() - {first} if chosen is None else chosen
         return texcoords, {name: values for name, values in attributes.items() if name in kept}
@@ -362,8 +343,7 @@ class MeshReader:
             normals = self._attribute("normals", values, indexed, interpolation, order, topology)
             return normals.values[topology.face_vertices if normals.indices is None else normals.indices]
 
-        normals = self.fitting(attribute, "the normals are left out", read, None)
-        if normals is None:
+        if (normals := self.fitting(attribute, "the normals are left out", read, None)) is None:
             return None
         return self.skinning.normals(mesh, cage.positions, cage.face_vertices, normals)
 
@@ -373,7 +353,7 @@ class MeshReader:
         values: NDArray[np.float64],
         indexed: Usd.Attribute | None,
         interpolation: str,
-        order: IntArray | None,  # As for `_primvars`
+        order: IntArray | None,
         topology: Topology,
         width: int | None = None,
     ) -> Attribute:
@@ -383,7 +363,7 @@ class MeshReader:
         indices = None if indexed is None else self.array(indexed, np.int64)
         if interpolation in ("vertex", "varying"):
             if indices is not None:
-                require_range(indices, len(values), f"{where} has")
+                validation.require_range(indices, len(values), f"{where} has")
                 values, indices = values[indices], None
         else:
             rows, count, per = order, len(vertices), "face corner"

@@ -30,8 +30,7 @@ class Skinning:
 
     def points(self, mesh: UsdGeom.Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points ``(n, 3)`` after blend shapes and joints, in the mesh's space; float32 where anything moves them."""
-        query = self._query(mesh.GetPrim())
-        if query is None:
+        if (query := self._query(mesh.GetPrim())) is None:
             return points
         if query.HasBlendShapes():
             points = self._blended(query, points)
@@ -44,8 +43,7 @@ class Skinning:
 
         Joints move each point by an affine map; its linear part is the difference of the images of shifted points.
         """
-        query = self._query(mesh.GetPrim())
-        if query is None:
+        if (query := self._query(mesh.GetPrim())) is None:
             return normals
         if query.HasBlendShapes():
             self._report("normals of polygons do not follow blend shapes", mesh.GetPath())
@@ -63,7 +61,6 @@ class Skinning:
         return np.divide(moved, length, out=normals.copy(), where=length > 0)
 
     def _query(self, prim: Usd.Prim) -> UsdSkel.SkinningQuery | None:
-        """The query of a mesh that a skeleton or blend shapes move; None for others."""
         from pxr import Usd, UsdSkel
 
         if not prim.HasAPI(UsdSkel.BindingAPI):

@@ -10,14 +10,13 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..cage.contents import Interpolation
 from ..cage.errors import CageError, shortened, warn
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from pxr import Gf, Sdf, Usd, UsdGeom
 
 # Attributes of a mesh that are rules of a cage. Chaikin's rule has none.
@@ -26,16 +25,14 @@ RULE_ATTRIBUTES = {
     "triangle_rule": "triangleSubdivisionRule",
     "face_varying": "faceVaryingLinearInterpolation",
 }
-# Values of subdivisionScheme, for surfaces that are smooth and for those that are not.
+# Values of subdivisionScheme for smooth and for flat surfaces.
 SCHEMES = {"catmullClark": "catmull_clark", "loop": "loop"}
 FLAT_SCHEMES = ("none", "bilinear")
 INTERPOLATIONS: dict[str, Interpolation] = {"vertex": "vertex", "varying": "varying", "faceVarying": "face_varying"}
 # Primvars that are texture coordinates by their name; the first is written.
 TEXCOORDS = ("st", "UVMap", "texcoords")
-# Values of purpose for prims that renderers do not show.
-HIDDEN_PURPOSES = ("guide", "proxy")
-# Value of `prim` that selects every mesh in the file.
-ALL = "*"
+HIDDEN_PURPOSES = ("guide", "proxy")  # Values of purpose for prims that renderers do not show
+ALL = "*"  # Value of `prim` that selects every mesh in the file
 # Characters of a message of the USD library that are shown, and that are searched for a reason.
 _MOST_SHOWN, _MOST_SEARCHED = 200, 10_000
 _MATERIALX = re.compile(r"Could not open asset @([^@]*\.mtlx)[@:]", re.IGNORECASE)
@@ -53,11 +50,11 @@ def require_usd(name: str, use: str = "reads") -> None:
 
 def open_stage(
     path: str | Path,
-    # Makes of the stage and the beginning of messages one that has what USD itself cannot open
+    # Returns a stage with the layers that USD itself cannot open, from the stage and the beginning of messages
     completed: Callable[[Usd.Stage, str], Usd.Stage] | None = None,
     over: str | Path | None = None,  # A layer that is stronger than the file
 ) -> Usd.Stage:
-    """Open the stage of a file, with everything that it refers to. Warns if something of it is not there."""
+    """Open the stage of a file, with its references. Warns of missing ones."""
     name = f'"{path}"'
     layer = _opened_layer(path)
     stronger = None if over is None else _opened_layer(over)
@@ -85,8 +82,7 @@ def _opened_layer(path: str | Path) -> Sdf.Layer:
             return Sdf.Layer.FindOrOpen(str(path))
         except Tf.ErrorException as error:
             reason = _commentary(error)
-            where = re.match(re.escape(os.path.abspath(path)) + r":(\d+):\d+: ", reason)
-            if where:
+            if where := re.match(re.escape(os.path.abspath(path)) + r":(\d+):\d+: ", reason):
                 # The parser names the rules of its grammar, which are in C++.
                 what = re.sub("parse error matching .* at ", "syntax error at ", reason[where.end() :], flags=re.DOTALL)
                 name, reason = f"{name}, line {where[1]}", what
@@ -94,7 +90,7 @@ def _opened_layer(path: str | Path) -> Sdf.Layer:
 
 
 def _sublayered(stronger: Sdf.Layer, weaker: Sdf.Layer) -> Sdf.Layer:
-    """A layer of two others, with what stages have of their root layer alone, such as the up axis."""
+    """A root layer with two sublayers, and their metadata of stages, such as the up axis."""
     from pxr import Sdf
 
     root = Sdf.Layer.CreateAnonymous(".usda")
@@ -107,7 +103,7 @@ def _sublayered(stronger: Sdf.Layer, weaker: Sdf.Layer) -> Sdf.Layer:
 
 
 def _warn_of_no_effect(name: str, layer: Sdf.Layer, stage: Usd.Stage) -> None:
-    """Warn of prims that a layer is over, and that are not there, or are parts of instances, where USD ignores it."""
+    """Warn of opinions about prims that do not exist, and about parts of instances, where USD ignores them."""
     missing: list[str] = []
     in_instances: list[str] = []
 
@@ -129,18 +125,14 @@ def _warn_of_no_effect(name: str, layer: Sdf.Layer, stage: Usd.Stage) -> None:
 
 
 def _warn_of_missing(name: str, errors: list[str]) -> None:
-    """Warn of assets that a stage refers to and that could not be opened, in one line for each kind."""
-    documents = [match[1] for match in map(_MATERIALX.search, errors) if match]
-    if documents:
+    """Warn of referenced assets that could not be opened, in one line for each kind."""
+    if documents := [match[1] for match in map(_MATERIALX.search, errors) if match]:
         files = _listed(sorted({os.path.basename(document) for document in documents}), 3)
         count = f"{len(documents)} references" if len(documents) > 1 else "a reference"
-        warn(
-            f"{name}: {count} to MaterialX documents left out, which usd-core cannot open ({files}); prims without "
-            "another material have their display colours (the package materialx reads documents; pip install "
-            '"mitsuba-subdivision[files]")'
-        )
-    others = [error for error in errors if not _MATERIALX.search(error)]
-    if others:
+        hint = 'the package materialx reads documents; pip install "mitsuba-subdivision[files]"'
+        left_out = f"{count} to MaterialX documents left out, which usd-core cannot open ({files})"
+        warn(f"{name}: {left_out}; prims without another material have their display colours ({hint})")
+    if others := [error for error in errors if not _MATERIALX.search(error)]:
         more = f" ({len(others)} such errors)" if len(others) > 1 else ""
         warn(f"{name}: the stage is incomplete: {_clear(others[0])}{more}")
 
@@ -170,9 +162,9 @@ def usd_errors_at(where: str) -> Iterator[None]:
 
 @contextmanager
 def usd_messages_of(name: str) -> Iterator[None]:
-    """Keep the USD library from printing in a ``with`` block; at its end, warn in one line of what it reported.
+    """Turn messages of the USD library in a ``with`` block into one warning that begins with a name.
 
-    Messages begin with the name. Composition errors are left out, as `open_stage` names them.
+    Composition errors are left out, as `open_stage` names them.
     """
     from pxr import UsdUtils
 
@@ -185,8 +177,7 @@ def usd_messages_of(name: str) -> Iterator[None]:
         del delegate
     # The function of the library that reports composition errors.
     others = [report for report in reports if not report.sourceFunction.endswith("_ReportErrors")]
-    texts = [_clear(report.commentary) for report in others]
-    if texts:
+    if texts := [_clear(report.commentary) for report in others]:
         count = len(set(texts)) - 1
         more = f" (and {count} other messages)" if count else ""
         warn(f"{name}: the USD library reports: {texts[0]}{more}")
@@ -237,19 +228,19 @@ def require_types(prim: Usd.Prim, time: Usd.TimeCode) -> None:
 
 def local_to_world(
     prim: Usd.Prim,
-    # Time code at which an attribute is read. Operations may have different ones.
     time_of: Callable[[Usd.Attribute], Usd.TimeCode],
-    # Transforms by path, to which those of the prim and the prims above are added
     known: dict[str, Gf.Matrix4d] | None = None,
 ) -> Gf.Matrix4d:
-    """Transform of a prim to world space, for row vectors."""
+    """Transform of a prim to world space, for row vectors, with operations at their own times.
+
+    Adds the transforms of the prim and of the prims above to the known ones, by their paths.
+    """
     from pxr import Gf, UsdGeom
 
     path, known = str(prim.GetPath()), {} if known is None else known
     if path not in known:
         matrix, resets = Gf.Matrix4d(1), prim.IsPseudoRoot()
-        here = UsdGeom.Xformable(prim)
-        if here:
+        if here := UsdGeom.Xformable(prim):
             # Times of samples are not asked for: with timeCodesPerSecond = 0, USD looks for them for ever.
             for operation in reversed(here.GetOrderedXformOps()):
                 matrix *= operation.GetOpTransform(time_of(operation.GetAttr()))
@@ -274,15 +265,11 @@ def chosen_meshes(
     stage: Usd.Stage,
     # Path of the mesh, or of a prim with one mesh below it; "*" for all meshes; None for the only mesh of the stage
     path: str | None,
-    name: str,  # Of the file in messages
-    time: Usd.TimeCode,  # At which visibility and schemes are read
+    name: str,
+    time: Usd.TimeCode,
     scheme: str | None,  # Replaces the meshes' own
 ) -> list[UsdGeom.Mesh]:
-    """The mesh to read, or all meshes.
-
-    Meshes that are not to be smoothed are skipped if there are others, with a warning. If all meshes are requested, so
-    are meshes that renderers do not show.
-    """
+    """The mesh to read, or all meshes; with a warning, without flat and hidden ones if there are others."""
     from pxr import Sdf, Usd, UsdGeom
 
     prims = stage.Traverse(Usd.TraverseInstanceProxies())
@@ -319,10 +306,8 @@ def chosen_meshes(
         below = without(below, lambda mesh: str(value_at(mesh.GetSubdivisionSchemeAttr(), time)) in FLAT_SCHEMES, why)
     if len(below) > 1 and path != ALL:
         where = f" below {path}" if path else ""
-        raise CageError(
-            f'{name}: there are {len(below)} meshes{where}; expected prim to name one of {_listed(below)}, or "{ALL}" '
-            "for all"
-        )
+        expected = f'expected prim to name one of {_listed(below)}, or "{ALL}" for all'
+        raise CageError(f"{name}: there are {len(below)} meshes{where}; {expected}")
     return [meshes[mesh] for mesh in below]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..cage.contents import RULES, Attribute, CageContents
 from ..whole_file import whole_file
-from .formats import warn_of_losses
+from .formats import Triangles, warn_of_losses
 from .usd_stage import INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, is_possible, require_usd, token
 
 if TYPE_CHECKING:
@@ -49,15 +49,9 @@ def write_usd(contents: CageContents, path: str | Path) -> None:
         _set_primvars(mesh, contents.texcoords, attributes)
 
 
-def write_usd_triangles(
-    path: str | Path,
-    positions: NDArray,
-    normals: NDArray,
-    triangles: NDArray,
-    texcoords: NDArray | None,
-    attributes: Mapping[str, NDArray],
-) -> None:
-    """Write triangles that are not to be subdivided to a USD file; see `formats.write_triangles`."""
+def write_usd_triangles(path: str | Path, surface: Triangles) -> None:
+    """Write triangles to a USD file in single precision, as a mesh without subdivision."""
+    positions, normals, triangles, texcoords, attributes = surface
     with _new_mesh(path, "surface", positions, np.full(len(triangles), 3), triangles) as mesh:
         from pxr import UsdGeom
 

@@ -23,20 +23,16 @@ from .fitting import Fit, Schedulable, Schedule, State
 from .smoothness import LargeSteps, regularizer, rows
 from .unknown_creases import UnknownCreases
 
-# The name of the fitted shape in its scene.
+# Names of the fitted shape in its scene, of its control points, and of the beginning of its attributes' names.
 SHAPE = "surface"
-CONTROL_POINTS = f"{SHAPE}.control_points"
+CONTROL_POINTS, CAGE_VALUES, TEXCOORDS = f"{SHAPE}.control_points", f"{SHAPE}.cage_", "texcoords"
+# The optimiser's names of the coordinates of control points, and of the sharpness of creases.
+U, SHARPNESS = "u", "sharpness"
 # Where outlines move, gradients need an integrator that knows of them. There are shadows, but few scenes need theirs.
 DEFAULT_INTEGRATOR = {"type": "direct_projective", "sppi": 0}
 DEFAULT_SHAPE = {"tessellation_rate": 4}
 
 Loss = Literal["l1", "l2"] | Callable[["mi.TensorXf", int], "mi.TensorXf"]
-# The optimiser's name of the coordinates of the control points.
-U = "u"
-# Its name of the sharpness of creases.
-SHARPNESS = "sharpness"
-# Parameters of the scene that are attributes of the cage begin with this.
-CAGE_VALUES, TEXCOORDS = f"{SHAPE}.cage_", "texcoords"
 # A surface of this size, in that of the initial one, has collapsed: its triangles have no area in single precision.
 COLLAPSED = 1e-4
 # Large steps reach their full λ from as many control points on, those of a cube refined twice. With fewer, each moves
@@ -110,8 +106,8 @@ class CageFit(Fit):
     scheme : str, optional
         By default that of the cage, or Catmull-Clark.
     loss : "l1", "l2" or callable
-        Mean absolute or squared difference of pictures, of which noise biases the absolute one; or a differentiable
-        function of a picture and the index of its view.
+        Mean absolute difference of pictures, which noise biases, or squared difference; or a differentiable function of
+        a picture and the index of its view.
     learning_rate : float or schedule
         How far a step moves the points at most, about, in diagonals of the box around ``cage``.
     smoothing : float
@@ -201,12 +197,9 @@ class CageFit(Fit):
         self._loss, self._smoothing, self._laplacian, self._seed = loss, smoothing, laplacian, seed
         self._size = float(np.linalg.norm(np.ptp(cage.positions, axis=0)))
         self._learning_rate = Schedule.of(learning_rate, "learning_rate")
-        self._weights = {
-            name: Schedule.of(weight, f"regularizer {name}") for name, weight in (regularizers or {}).items()
-        }
+        weights, self._other_names = regularizers or {}, tuple(others or {})
+        self._weights = {name: Schedule.of(weight, f"regularizer {name}") for name, weight in weights.items()}
         self._other_rates = {name: Schedule.of(rate, f"others {name}") for name, rate in (others or {}).items()}
-        # Without the sharpness of creases.
-        self._other_names = tuple(self._other_rates)
         self._creases: UnknownCreases | None = None
         if sharp_edges is not None:
             creases = _checked_creases(crease_of, len(np.atleast_2d(sharp_edges)))
@@ -250,7 +243,6 @@ class CageFit(Fit):
 
     @property
     def control_points(self) -> FloatArray:
-        """``(n, 3)`` current control points."""
         with dr.suspend_grad():
             return rows(self._points())
 
@@ -297,7 +289,6 @@ class CageFit(Fit):
         return {name: dr.detach(self._others[name]) for name in self._other_names}
 
     def _points(self) -> dr.ArrayBase:
-        """Flat control points, computed from the optimiser's variables."""
         u = self._optimizer[U]
         return u if self._steps is None else self._steps.from_differential(u)
 
@@ -327,10 +318,8 @@ class CageFit(Fit):
         if self._creases is not None:
             self._others[SHARPNESS] = dr.clip(self._others[SHARPNESS], 0, self._creases.highest)
         if not self._extent() >= COLLAPSED * self._initial_extent:
-            raise RuntimeError(
-                f"step {number}, with the learning rate {self._learning_rate(number):g}, moved all control points to "
-                "one place; expected a smaller learning_rate, or smaller weights of regularizers"
-            )
+            what = f"step {number}, with the learning rate {self._learning_rate(number):g}, moved all control points"
+            raise RuntimeError(f"{what} to one place; expected a smaller learning_rate, or smaller regularizers")
         return value
 
     def _difference(self, image: mi.TensorXf, view: int) -> mi.TensorXf:
@@ -339,7 +328,7 @@ class CageFit(Fit):
         return dr.mean(size * self._masks[view], axis=None)
 
     def _extent(self) -> float:
-        """Diagonal of the box around the optimiser's variables: 0 where that around the control points is."""
+        """Diagonal of the box around the optimiser's variables: 0 where all control points are at one place."""
         return float(np.linalg.norm(np.ptp(rows(self._optimizer[U]), axis=0)))
 
     def _state(self) -> State:
@@ -352,8 +341,7 @@ class CageFit(Fit):
         return state
 
     def _restore(self, state: State) -> None:
-        creases = self._creases
-        if creases is not None:
+        if (creases := self._creases) is not None:
             self._start = creases.with_sharpness(state["start: sharpness"], state["start: positions"])
             self._creases = UnknownCreases(self._start, creases.edges, creases.crease_of, creases.highest, self._scheme)
             self._load(LimitSurface(self._start, self._scheme), self._start.positions)
@@ -370,7 +358,6 @@ def _adam_state(optimizer: mi.ad.Optimizer, name: str, prefix: str) -> dict[str,
 
 
 def _restore_adam(optimizer: mi.ad.Optimizer, name: str, prefix: str, state: State) -> None:
-    """Give a state to a variable of ``mi.ad.Adam``."""
     value, _, _, (steps, first, second, *_) = optimizer.state[name]
     optimizer[name] = upload(type(value), state[f"{prefix}: value"])
     value, promoted, rate, (*_, more) = optimizer.state[name]
@@ -380,16 +367,12 @@ def _restore_adam(optimizer: mi.ad.Optimizer, name: str, prefix: str, state: Sta
 
 
 def _checked_creases(crease_of: ArrayLike | None, edge_count: int) -> IntArray:
-    """Return the crease of each edge, checked."""
     creases = np.arange(edge_count) if crease_of is None else np.asarray(crease_of)
     if creases.shape != (edge_count,) or not np.issubdtype(creases.dtype, np.integer):
-        raise ValueError(
-            f"crease_of of the shape {creases.shape} and type {creases.dtype}; expected ({edge_count},) integers, one "
-            "for each of sharp_edges"
-        )
+        given = f"crease_of of the shape {creases.shape} and type {creases.dtype}"
+        raise ValueError(f"{given}; expected ({edge_count},) integers, one for each of sharp_edges")
     missing = np.setdiff1d(np.arange(creases.max(initial=-1) + 1), creases)
     if (creases < 0).any() or len(missing):
-        wrong = int(creases.min()) if (creases < 0).any() else int(missing[0])
-        what = f"has a crease {wrong}" if wrong < 0 else f"skips crease {wrong}"
+        what = f"has a crease {creases.min()}" if (creases < 0).any() else f"skips crease {missing[0]}"
         raise ValueError(f"crease_of {what}; expected consecutive indices from 0")
     return creases.astype(np.int64)

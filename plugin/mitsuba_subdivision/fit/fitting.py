@@ -23,14 +23,13 @@ from ..whole_file import whole_file
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# A loss has stopped falling when its mean over this many steps is within this part of that over as many before.
+# A loss has stopped falling when its means over this many steps and over as many before differ by less than this part.
 STEPS_OF_MEAN, LEAST_FALL = 10, 0.02
 
 # Layout of checkpoints, and what their numbers mean: those of control points depend on λ of large steps.
 FORMAT = 2
 
-# What steps have changed: arrays by their names, "variable: field".
-State = Mapping[str, NDArray]
+State = Mapping[str, NDArray]  # What steps have changed: arrays by their names, "variable: field"
 # A number, or what users may give instead.
 Schedulable = float | Sequence[tuple[float, float]] | Callable[[int], float]
 
@@ -53,14 +52,11 @@ class Fit(ABC):
         refine: Sequence[int] | int,
         callbacks: Sequence[Callable[[Any], None]],
     ) -> None:
-        self._refine, self._callbacks = refine, tuple(callbacks)
+        self._refine, self._callbacks, self._scheme = refine, tuple(callbacks), scheme
         self.losses: list[float] = []
         self.refinements = 0
-        # Steps since the last refinement.
-        self._since = 0
-        self._scheme = scheme
-        # Where its points began, refined as often.
-        self._start = cage
+        self._since = 0  # Steps since the last refinement
+        self._start = cage  # With the initial control points, refined as often as the cage
         self._load(LimitSurface(cage, scheme), cage.positions)
 
     @abstractmethod
@@ -108,7 +104,7 @@ class Fit(ABC):
         self.losses.append(loss)
         for callback in self._callbacks:
             callback(self)
-        return self.losses[-1]
+        return loss
 
     def run(self, steps: int, checkpoint: str | Path | None = None, every: int = 50) -> Self:
         """Take some steps; on a terminal, a line counts them.
@@ -172,8 +168,8 @@ class Fit(ABC):
         _save(path, self._arrays())
 
     def _arrays(self) -> dict[str, Any]:
-        """Contents of a checkpoint, which later steps leave as they are."""
         counts = {"refinements": self.refinements, "since": self._since}
+        # A copy, as later steps lengthen the list.
         return {"format": FORMAT, "losses": list(self.losses), **counts, **self._state()}
 
     def resume(self, path: str | Path) -> Self:
@@ -194,19 +190,15 @@ class Fit(ABC):
             raise ValueError(f'"{path}" is no checkpoint of a fit: {error}') from error
         if "format" not in arrays or int(arrays["format"]) != FORMAT:
             raise ValueError(f'"{path}" is no checkpoint of a fit, or one of another version of this package')
-        refinements = int(arrays["refinements"])
-        if self.refinements > refinements:
-            raise ValueError(
-                f'"{path}" was saved after {refinements} refinements; this fit has had {self.refinements} already'
-            )
+        refinements, own = int(arrays["refinements"]), self.refinements
+        if own > refinements:
+            raise ValueError(f'"{path}" was saved after {refinements} refinements; this fit has had {own} already')
         while self.refinements < refinements:
             self.refine()
         for name, values in self._state().items():
             if name not in arrays or arrays[name].shape != np.shape(values):
-                variable = name.partition(":")[0]
-                raise ValueError(
-                    f'the checkpoint has no "{variable}" of this fit; expected that of a fit with the same arguments'
-                )
+                lacking = f'the checkpoint has no "{name.partition(":")[0]}" of this fit'
+                raise ValueError(f"{lacking}; expected that of a fit with the same arguments")
         self._restore(arrays)
         self.losses, self._since = arrays["losses"].tolist(), int(arrays["since"])
         return self

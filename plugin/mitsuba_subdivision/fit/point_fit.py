@@ -20,15 +20,12 @@ from ..surface import LimitSurface
 from .fitting import Fit, Schedulable, Schedule, State
 from .smoothness import quadratic_form
 
-# Name of the control points in checkpoints.
-POINTS = "points: value"
-# Parts of the surface have no points nearby if these are further than this many median distances of a point from
-# the next one. Gaps between random points are smaller.
+POINTS = "points: value"  # In checkpoints
+# Parts of the surface have no points nearby if these are further away than this many median distances between points.
+# Gaps between random points are smaller.
 NEAR = 5.0
-# Weight that holds each control point where it is, relative to the mean weight of points.
-DAMPING = 1e-8
-# Points on the mesh for each control point that the fit ends with, by default.
-POINTS_PER_CONTROL_POINT = 8
+DAMPING = 1e-8  # Weight that holds each control point where it is, relative to the mean weight of points
+POINTS_PER_CONTROL_POINT = 8  # Points on the mesh for each control point that the fit ends with, by default
 
 
 # Points of the surface, as (s, n) weights over control points; their targets, (s, 3); and unit normals, (s, 3), along
@@ -96,21 +93,18 @@ class PointFit(Fit):
         callbacks: Sequence[Callable[[PointFit], None]] = (),
     ) -> None:
         self._points = _checked(points, "points")
-        self._normals = None
-        if normals is not None:
-            given = _checked(normals, "normals")
-            if given.shape != self._points.shape:
-                raise ValueError(f"{len(given)} normals of {len(self._points)} points; expected one of each")
-            length = np.linalg.norm(given, axis=1, keepdims=True)
-            self._normals = given / np.where(length > 0, length, 1)
+        # Only their signs in products with other normals count.
+        self._normals = None if normals is None else _checked(normals, "normals")
+        if self._normals is not None and len(self._normals) != len(self._points):
+            raise ValueError(f"{len(self._normals)} normals of {len(self._points)} points; expected one of each")
         self._tree: cKDTree | None = None
         if both_ways and len(self._points) > 1:
             self._tree = cKDTree(self._points)
             self._near = NEAR * float(np.median(np.array(self._tree.query(self._points, k=[2])[0])))
         self._size = float(np.linalg.norm(np.ptp(self._points, axis=0)))
         self._sliding, self._seed = Schedule.of(sliding, "sliding"), seed
-        regularizers = {"bending": 1e-8, **({} if regularizers is None else regularizers)}
-        self._rates = {name: Schedule.of(weight, f"regularizer {name}") for name, weight in regularizers.items()}
+        weights = {"bending": 1e-8, **(regularizers or {})}
+        self._rates = {name: Schedule.of(weight, f"regularizer {name}") for name, weight in weights.items()}
         super().__init__(cage, scheme, refine, callbacks)
 
     def _load(self, start: LimitSurface, positions: FloatArray) -> None:
@@ -132,7 +126,6 @@ class PointFit(Fit):
         return loss
 
     def _pairs(self, surface: LimitSurface, seed: int) -> Pairs:
-        """Current pairs of nearest points."""
         parts = [self._paired(surface, surface.closest_point(self._points), np.arange(len(self._points)))]
         if self._tree is not None:
             samples = surface.sample(len(self._points), seed)
@@ -144,10 +137,7 @@ class PointFit(Fit):
         return sparse.csr_array(sparse.vstack(weights)), np.concatenate(goals), np.concatenate(across)
 
     def _paired(self, surface: LimitSurface, at: ClosestPoints | AreaSamples, goal: IntArray) -> Pairs:
-        """Pair locations on a surface with their target points, given by index; -1 for none.
-
-        A point whose normal shows that it belongs to another side has no pair either.
-        """
+        """Pair locations on a surface with their target points, given by index; -1 or another normal: none."""
         is_pair = goal >= 0
         if self._normals is not None:
             is_pair &= (at.n * self._normals[goal]).sum(axis=1) >= 0
@@ -240,10 +230,9 @@ def mesh_samples(positions: FloatArray, triangles: IntArray, count: int, seed: i
     """Points on triangles, uniform by area, and their normals."""
     if positions.ndim != 2 or positions.shape[1] != 3:
         raise ValueError(f"positions of the shape {positions.shape}; expected (n, 3)")
-    if triangles.ndim != 2 or triangles.shape[1] != 3 or not np.issubdtype(triangles.dtype, np.integer):
-        raise ValueError(
-            f"triangles of the shape {triangles.shape} and type {triangles.dtype}; expected (m, 3) integers"
-        )
+    if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
+        given = f"triangles of the shape {triangles.shape} and type {triangles.dtype}"
+        raise ValueError(f"{given}; expected (m, 3) integers")
     if len(triangles) and (triangles.min() < 0 or triangles.max() >= len(positions)):
         row = int(np.flatnonzero(((triangles < 0) | (triangles >= len(positions))).any(axis=1))[0])
         expected = f"expected vertices from 0 to {len(positions) - 1}"

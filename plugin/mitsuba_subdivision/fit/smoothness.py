@@ -88,8 +88,8 @@ def rows(points: dr.ArrayBase | NDArray) -> FloatArray:
 def quadratic_form(name: str, start: LimitSurface) -> tuple[sparse.csr_array, FloatArray]:
     """Return Q and x0 of a quadratic regularizer, ``(n, n)`` and ``(n, 3)``, for a surface as a fit begins.
 
-    Q is symmetric and positive semi-definite. "laplacian" is the mean squared distance of control points from the mean
-    of their neighbours, "anchor" that from their initial positions. Raises ValueError if there is none of that name.
+    "laplacian" is the mean squared distance of control points from the mean of their neighbours, "anchor" that from
+    their initial positions. Raises ValueError for other names.
     """
     _require_name(name, QUADRATIC)
     points, count = start.cage.positions, start.cage.vertex_count

@@ -26,9 +26,8 @@ from ..refinement.cage_refinement import CageRefinement, built
 from ..schemes.domain import FloatArray
 from .smoothness import rows
 
-# More refinements than these would make a thousand faces and more of each.
-MOST_REFINEMENTS = 6
-# Of differences by sharpness; one at an integer begins so far inside the interval. Rounding leaves 1e-10 of it.
+MOST_REFINEMENTS = 6  # More refinements than these would make a thousand faces and more of each
+# Step of differences by sharpness, and their distance from an integer. Rounding leaves 1e-10 of it.
 STEP = 1e-6
 
 
@@ -36,9 +35,8 @@ class UnknownCreases:
     """A cage some of whose creases have a sharpness that is not known yet.
 
     Derivatives at integers are those of the interval above, at ``highest`` of the one below. Where creases of unequal
-    sharpness meet, points may jump at integers: a vertex takes the mean sharpness of what a refinement makes smooth.
-    Raises CageError, SchemeError of an edge that is not between two faces, of ``highest`` out of range, and those of
-    `ControlCage.refinement`.
+    sharpness meet, points may jump at integers: a vertex takes the mean sharpness of creases that become smooth there.
+    Raises CageError for an edge that is not between two faces, and those of `ControlCage.refinement`.
     """
 
     def __init__(

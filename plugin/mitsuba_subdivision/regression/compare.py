@@ -12,19 +12,7 @@ from numpy.typing import NDArray
 
 from . import RegressionError
 from .image import RGB, Image
-from .tiers import (
-    DEFAULT_TIERS,
-    TIERS,
-    Status,
-    TierResult,
-    Tolerances,
-    compare_flip,
-    compare_paired,
-    compare_probes,
-    compare_tiles,
-    levels,
-    pixel_of_largest,
-)
+from .tiers import DEFAULT_TIERS, TIERS, Status, TierResult, Tolerances, compare_tier, levels, pixel_of_largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,16 +21,13 @@ class WorstPixel:
 
     y: int
     x: int
-    # Name of the tier that chose the pixel; "z-score" or "difference" where no tier failed or warned.
-    shown_by: str
+    shown_by: str  # The tier that chose the pixel; "z-score" or "difference" where no tier failed or warned
     # The pixel's values; those of the first batch if the paired tier chose it
     reference: tuple[float, ...]
     test: tuple[float, ...]
-    # R, G and B, and what else differs
-    names: tuple[str, ...] = RGB
-    # The first hit of the ray through the pixel, by the reference's probe, or else the test's.
-    surface: str | None = None
-    # Normal in the reference and in the test, if the probe tier chose the pixel.
+    names: tuple[str, ...] = RGB  # R, G and B, and other channels that differ
+    surface: str | None = None  # First hit of the ray through the pixel, by the reference's probe, or else the test's
+    # Normals in the reference and in the test, if the probe tier chose the pixel
     normals: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def __str__(self) -> str:
@@ -61,13 +46,11 @@ class Comparison:
     test: Image
     tiers: list[TierResult]
     tolerances: Tolerances
-    # Further results: the relative error of the whole image, files that changed, a second attempt
-    notes: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)  # The relative error, files that changed, a second attempt
     numbers: dict[str, Any] = field(default_factory=dict)
 
     @property
     def status(self) -> Status:
-        """The worst of the tiers'."""
         return max((tier.status for tier in self.tiers), key=list(Status).index)
 
     @cached_property
@@ -90,16 +73,14 @@ class Comparison:
 
     @property
     def exit_status(self) -> int:
-        """0 for pass, 1 for warn, 2 for fail."""
         return {Status.PASS: 0, Status.WARN: 1, Status.FAIL: 2}[self.status]
 
     @property
     def maps(self) -> dict[str, NDArray[np.floating]]:
-        """Maps of all tiers, by their names."""
         return {name: values for tier in self.tiers for name, values in tier.maps.items()}
 
     def tier(self, name: str) -> TierResult | None:
-        """Result of the tier of a name, None if that did not run."""
+        """Result of a tier, None if it did not run."""
         return next((tier for tier in self.tiers if tier.name == name), None)
 
     def __str__(self) -> str:
@@ -111,16 +92,14 @@ class Comparison:
         return "\n".join([*lines, *(f"  {line}" for line in self.remarks())])
 
     def remarks(self) -> list[str]:
-        """The notes, and the worst pixel in words."""
         return [*self.notes, *([str(self.worst)] if self.worst else [])]
 
     def undecided(self) -> list[str]:
-        """What no tier decided, one text for each that warns or could not run, with its reason."""
+        """Tiers that warn or could not run, with their reasons."""
         tiers = [tier for tier in self.tiers if tier.status in (Status.WARN, Status.SKIPPED)]
         return [f"{tier.name}: {'; '.join(tier.lines)}" for tier in tiers]
 
     def as_dict(self) -> dict[str, Any]:
-        """The comparison as plain values, for JSON."""
         return {
             "status": self.status.value,
             "reference": self.reference.name,
@@ -149,46 +128,38 @@ def compare(
     An image with pixels that are not finite fails at once, and no tier runs. The tile tier also runs, and decides,
     where the paired tier cannot: the samples are not the same, or pixels differ and so does the machine or the library.
     Where the same samples give the same bits and the probe passes, the tile tier cannot fail.
-    Raises RegressionError if an image is denoised, the sizes or display windows differ, a tier is unknown, or the
-    images lack what a tier compares that was chosen.
+    Raises RegressionError for images that cannot be compared, and for tiers that are unknown or lack their channels.
     """
     for image in (reference, test):
         if image.metadata.get("denoised"):
-            raise RegressionError(
-                f'"{image.name}" is denoised, which removes what is compared; expected it as rendered'
-            )
+            raise RegressionError(f'"{image.name}" is denoised, and its noise is needed; expected it as rendered')
     if (reference.size, reference.origin) != (test.size, test.origin):
-        texts = [
-            '"{}" has {} x {} pixels (display window from x = {}, y = {})'.format(
-                image.name, *image.size, *image.origin
-            )
-            for image in (reference, test)
-        ]
-        raise RegressionError(f"{texts[0]} and {texts[1]}; expected the same window")
-    unknown = [name for name in tiers or () if name not in TIERS]
-    if unknown:
+        form = '"{}" has {} x {} pixels (display window from x = {}, y = {})'
+        windows = " and ".join(form.format(image.name, *image.size, *image.origin) for image in (reference, test))
+        raise RegressionError(f"{windows}; expected the same window")
+    if unknown := [name for name in tiers or () if name not in TIERS]:
         raise RegressionError(f'unknown tier "{unknown[0]}"; expected some of {", ".join(TIERS)}')
     limits = tolerances or Tolerances().with_values(reference.metadata.get("tolerances", {}))
 
     for image, role in ((test, "test"), (reference, "reference")):
-        broken = image.not_finite()
-        if broken:
+        if broken := image.not_finite():
             result = TierResult("finite", Status.FAIL, [f"the {role} is not: {broken[0]}"], worst=broken[1])
             return Comparison(reference, test, [result], limits)
 
     names = tuple(name for name in reference.names if name in test.names)
     of_missing = _missing(reference, test, missing)
     reference, test = (image.with_channels(names) for image in (reference, test))
-    compared_by: dict[str, Callable[[], TierResult]] = {
-        "probe": lambda: compare_probes(reference, test, limits),
-        "paired": lambda: compare_paired(reference, test, limits),
-        "tile": lambda: compare_tiles(reference, test, limits, suite_size),
-        "flip": lambda: compare_flip(reference, test, limits),
-    }
-    results = {name: compared_by[name]() for name in tiers or DEFAULT_TIERS}
-    _decide(results, compared_by, tiers)
-    notes, numbers = _relative_error(reference, test)
-    notes += _changed_files(reference, test)
+
+    def compared(name: str) -> TierResult:
+        return compare_tier(name, reference, test, limits, suite_size)
+
+    results = {name: compared(name) for name in tiers or DEFAULT_TIERS}
+    _decide(results, compared, tiers)
+    note, numbers = _relative_error(reference, test)
+    notes, before, now = [note], *(image.metadata.get("files") or {} for image in (reference, test))
+    changed = sorted(n for n in {*before, *now} if before.get(n) != now.get(n))
+    if before and now and changed:
+        notes.append(f"changed since the reference was made: {', '.join(changed)}")
     if of_missing:
         results["channels"] = of_missing
     if of_missing or names != RGB:
@@ -196,7 +167,7 @@ def compare(
     return Comparison(reference, test, list(results.values()), limits, notes, numbers)
 
 
-# What channels mean that only one of two images has.
+# Status of a comparison where only one image has some channels.
 MISSING = {"ignore": Status.PASS, "warn": Status.WARN, "fail": Status.FAIL}
 
 
@@ -209,8 +180,7 @@ def _missing(reference: Image, test: Image, meaning: str) -> TierResult | None:
         only = [name for name in image.names if name not in other.names]
         lines += [f"only the {role} has {', '.join(only)}"] if only else []
     if lines and meaning == "warn" and "sampling" in reference.metadata and "channels" not in reference.metadata:
-        # It stays as good as it was.
-        status = Status.PASS
+        status = Status.PASS  # It stays as good as it was
         lines.append("the reference is of an older version, which stored R, G, B: make it again to compare all")
     return TierResult("channels", status, lines) if lines else None
 
@@ -221,22 +191,19 @@ def relmse(reference: NDArray[np.floating], test: NDArray[np.floating]) -> float
 
 
 def _decide(
-    results: dict[str, TierResult], compared_by: dict[str, Callable[[], TierResult]], chosen: Sequence[str] | None
+    results: dict[str, TierResult], compared: Callable[[str], TierResult], chosen: Sequence[str] | None
 ) -> None:
-    """Let other tiers decide where one cannot, and where one proves that another's finding is chance.
-
-    Raises RegressionError if a tier that was chosen cannot run, and no other stands in for it.
-    """
+    """Let other tiers decide where one cannot, and where one proves that another's finding is chance."""
     paired, is_replaced = results.get("paired"), False
     if paired and paired.status in (Status.SKIPPED, Status.WARN):
-        tile = results["tile"] = results.get("tile") or compared_by["tile"]()
+        tile = results["tile"] = results.get("tile") or compared("tile")
         is_replaced = tile.status is not Status.SKIPPED
         if is_replaced:
             paired.lines.append("the tile tier decides instead")
         elif paired.status is Status.WARN:
             paired.status = Status.FAIL
     if chosen is None and all(result.status is Status.SKIPPED for name, result in results.items() if name != "probe"):
-        results["flip"] = compared_by["flip"]()
+        results["flip"] = compared("flip")
     for result in results.values():
         cannot_run = result.status is Status.SKIPPED and not (result is paired and is_replaced)
         if cannot_run and result.name in (chosen or ()):
@@ -248,7 +215,7 @@ def _decide(
         tiles.lines.insert(0, "chance: the same samples give the same bits, and the probe passes")
 
 
-def _relative_error(reference: Image, test: Image) -> tuple[list[str], dict[str, Any]]:
+def _relative_error(reference: Image, test: Image) -> tuple[str, dict[str, Any]]:
     """The relative mean squared error, and how large noise alone would make it."""
     seen = reference.seen_with(test)
     numbers = {"relmse": relmse(reference.rgb[seen], test.rgb[seen])}
@@ -257,13 +224,7 @@ def _relative_error(reference: Image, test: Image) -> tuple[list[str], dict[str,
         estimates = (reference.estimate, test.estimate)
         a, b = (estimate.variance[..., :3] / estimate.count[..., None] for estimate in estimates)
         text += f"; noise alone would make it {np.mean(((a + b) / (reference.rgb**2 + 0.01))[seen]):.3g}"
-    return [text], numbers
-
-
-def _changed_files(reference: Image, test: Image) -> list[str]:
-    before, now = (image.metadata.get("files") or {} for image in (reference, test))
-    changed = sorted(n for n in {*before, *now} if before.get(n) != now.get(n)) if before and now else []
-    return [f"changed since the reference was made: {', '.join(changed)}"] if changed else []
+    return text, numbers
 
 
 def _worst_pixel(reference: Image, test: Image, pixel: tuple[int, int], shown_by: str) -> WorstPixel:

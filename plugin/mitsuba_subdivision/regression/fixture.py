@@ -31,8 +31,7 @@ from .tiers import Status, Tolerances
 CLAIMS = pytest.StashKey[dict[Path, tuple[str, str]]]()
 TOO_LATE = "mitsuba was imported before mitsuba_subdivision, which would have found it an LLVM library;"
 NAME = "expected another name=.. for one of them"
-# Parameters of the scene's file, and which of its sensors renders.
-_Settings = tuple[dict[str, str], int]
+_Settings = tuple[dict[str, str], int]  # Parameters of the scene's file, and which of its sensors renders
 
 
 class RenderRegression:
@@ -66,8 +65,8 @@ class RenderRegression:
     ) -> Comparison | None:
         """Render a scene, and fail the pytest test if the render differs from the scene's reference.
 
-        What could not be decided is a warning of pytest, and a property of the test, which JUnit files have. Returns
-        None if the reference was written instead of compared with.
+        Undecided comparisons are warnings of pytest, and properties of the test in JUnit files. Returns None if the
+        reference was written instead of compared with.
 
         Parameters
         ----------
@@ -90,7 +89,7 @@ class RenderRegression:
         tolerances : dict, optional
             Fields of `Tolerances` to use instead of those stored with the reference. A new reference stores them.
         missing_channels : str
-            What channels mean that only the reference or only the test has: "ignore", "warn" or "fail".
+            Effect of channels that only one of the images has: "ignore", "warn" or "fail".
         seed : int
             From 0 on: each has other samples for the tile tier.
         """
@@ -143,7 +142,7 @@ class RenderRegression:
         report = self._report(comparison, title, scene, path)
         if comparison.status is not Status.FAIL:
             self.node.add_report_section("call", "render difference", str(comparison))
-            self._tell_undecided(title, comparison, sensor)
+            self._warn_of_undecided(title, comparison, sensor)
             return comparison
         if self.update != "no":
             write()
@@ -151,7 +150,6 @@ class RenderRegression:
         pytest.fail(f"{comparison}{report}", False)
 
     def _located(self, scene: SceneSource) -> SceneSource:
-        """The scene; its path relative to the test's file, or else to the root folder."""
         if not isinstance(scene, (str, Path)):
             return scene
         folders = dict.fromkeys([self.node.path.parent, self.node.config.rootpath])
@@ -187,10 +185,11 @@ class RenderRegression:
             pytest.fail(f'"{path}" is the reference of "{other}" in {test}, and of "{words}" here; {NAME}', False)
         self.node.user_properties.append(("render_reference", os.path.relpath(path, self.references)))
 
-    def _tell_undecided(self, name: str, comparison: Comparison, sensor: int | None) -> None:
-        count = comparison.test.metadata["sensors"]
-        told = f"sensor 0 of {count} was compared; sensor=1 compares another, sensor=0 only this one"
-        for line in [*comparison.undecided(), *([told] if sensor is None and count > 1 else [])]:
+    def _warn_of_undecided(self, name: str, comparison: Comparison, sensor: int | None) -> None:
+        count, lines = comparison.test.metadata["sensors"], comparison.undecided()
+        if sensor is None and count > 1:
+            lines.append(f"sensor 0 of {count} was compared; sensor=1 compares another, sensor=0 only this one")
+        for line in lines:
             self.node.user_properties.append(("render_undecided", f"{name}: {line}"))
             warnings.warn(RenderWarning(f"{name}: {line}"), stacklevel=3)
 
@@ -215,7 +214,7 @@ def _settings_of(metadata: dict[str, Any]) -> _Settings:
 
 
 def _suffix(settings: _Settings) -> str:
-    """The settings as part of a name; their checksum if they are long or no file could have that name."""
+    """The settings as part of a name, or their checksum where a file cannot have that name."""
     values = {**settings[0], **({"sensor": str(settings[1])} if settings[1] else {})}
     text = "".join(f"-{key}={value}" for key, value in sorted(values.items()))
     if re.fullmatch(r"[\w.,=+-]{0,80}", text):

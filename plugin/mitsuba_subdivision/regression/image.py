@@ -6,7 +6,7 @@ import json
 import os
 import re
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,8 +21,7 @@ from . import ContentElsewhere, RegressionError
 
 SCHEMA = 1
 METADATA_ATTRIBUTE = "mitsuba_subdivision:metadata"
-# Index that stands for no shape, no triangle or no element.
-NOTHING = 2**32 - 1
+NOTHING = 2**32 - 1  # Index that stands for no shape, no triangle or no element
 
 Channels = dict[str, NDArray]
 
@@ -48,9 +47,8 @@ def without_sample_counts(sampler: str) -> str:
 class Estimate:
     """Pixels estimated from batches of samples.
 
-    A batch is a small render of its own. The variance of a sample is the variance of the batches' means, times the
-    samples in a batch. That stays right where the samples of a batch depend on each other, as with stratified samplers,
-    and a renderer needs to output images only.
+    The variance of a sample is the variance of the batches' means, times the samples in a batch. That stays right where
+    the samples of a batch depend on each other, as with stratified samplers.
     """
 
     mean: NDArray[np.float64]  # (height, width, channels)
@@ -65,21 +63,19 @@ class Estimate:
         return cls(mean, np.zeros_like(mean), np.full(mean.shape[:2], samples, dtype=np.int64), 1)
 
     def stored(self) -> Estimate:
-        """The estimate as it would come back from a file, rounded to single precision."""
+        """The estimate rounded to single precision, as in a file."""
         with np.errstate(over="ignore"):
             mean, variance = (values.astype(np.float32).astype(np.float64) for values in (self.mean, self.variance))
         return Estimate(mean, variance, self.count, self.batches)
 
 
 def combine(estimates: Iterable[Estimate]) -> Estimate:
-    """Combine estimates with independent samples into one, in double precision.
+    """Combine estimates with independent samples; in the same order, the same estimates give the same bits.
 
-    The sums of squares are updated pairwise [Chan et al. 1979], without the cancellation of ``E[x^2] - E[x]^2``. In the
-    same order, the same estimates give the same bits. Raises RegressionError if there is none, or their sizes differ.
+    The sums of squares are updated pairwise [Chan et al. 1979], without the cancellation of ``E[x^2] - E[x]^2``.
     """
     rest = iter(estimates)
-    total = next(rest, None)
-    if total is None:
+    if (total := next(rest, None)) is None:
         raise RegressionError("there is nothing to combine")
     squares = total.variance * max(total.batches - 1, 0)
     for estimate in rest:
@@ -89,7 +85,7 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
         count = total.count + estimate.count
         share = (estimate.count / count)[..., None]
         batches = total.batches + estimate.batches
-        # What is not finite is told of the image.
+        # `Image.not_finite` reports values that are not finite.
         with np.errstate(invalid="ignore", over="ignore"):
             step = estimate.mean - total.mean
             squares_within = estimate.variance * max(estimate.batches - 1, 0)
@@ -114,14 +110,14 @@ class Probe:
 
     @property
     def hit(self) -> NDArray[np.bool_]:
-        """Pixels whose ray hits something."""
         return self.shape != NOTHING
 
     def channels(self) -> Channels:
-        """Channels of an OpenEXR file."""
-        fields = {name: np.atleast_3d(getattr(self, name)) for name in _PROBE}
-        places = [(name, i, channel) for name, names in _PROBE.items() for i, channel in enumerate(names)]
-        return {f"{_OF_PROBE}{channel}": fields[name][..., i] for name, i, channel in places}
+        return {
+            f"{_OF_PROBE}{channel}": values
+            for name, names in _PROBE.items()
+            for channel, values in zip(names, np.moveaxis(np.atleast_3d(getattr(self, name)), 2, 0), strict=True)
+        }
 
     def describe(self, y: int, x: int, shapes: Sequence[str] = ()) -> str:
         """Text of the first hit of the ray through a pixel, by the ids of the scene's shapes, if these are known."""
@@ -145,7 +141,7 @@ class Image:
     paired: NDArray[np.float64] | None = None
     probe: Probe | None = None
     metadata: dict[str, Any] = field(default_factory=dict)  # How the image was made
-    names: tuple[str, ...] = RGB  # Of the channels
+    names: tuple[str, ...] = RGB  # Channels
     # First column and row of the display window of a file, and which of its pixels have data; None for all.
     origin: tuple[int, int] = (0, 0)
     has_data: NDArray[np.bool_] | None = None
@@ -156,20 +152,16 @@ class Image:
         return self.pixels.shape[1], self.pixels.shape[0]
 
     def seen_with(self, other: Image) -> NDArray[np.bool_]:
-        """Pixels of which one of two images has data; all if none has, as where one was made without a file."""
-        every = np.ones(self.pixels.shape[:2], dtype=bool)
-        if self.has_data is None or other.has_data is None:
-            return every
-        seen = self.has_data | other.has_data
-        return seen if seen.any() else every
+        """Pixels where one of two images has data; all if none has, as where one was made without a file."""
+        if self.has_data is None or other.has_data is None or not (self.has_data | other.has_data).any():
+            return np.ones(self.pixels.shape[:2], dtype=bool)
+        return self.has_data | other.has_data
 
     @property
     def rgb(self) -> NDArray[np.float64]:
-        """R, G and B of each pixel."""
         return self.pixels[..., :3]
 
     def with_channels(self, names: tuple[str, ...]) -> Image:
-        """The image with some of its channels only."""
         at, estimate = [self.names.index(name) for name in names], self.estimate
         if estimate is not None:
             estimate = replace(estimate, mean=estimate.mean[..., at], variance=estimate.variance[..., at])
@@ -177,7 +169,6 @@ class Image:
         return replace(self, pixels=self.pixels[..., at], estimate=estimate, paired=paired, names=names)
 
     def channels(self) -> Channels:
-        """Channels of an OpenEXR file, in single precision."""
         channels = _named("", self.pixels, self.names)
         if self.estimate is not None:
             channels |= _named("variance.", self.estimate.variance, self.names) | {"N": self.estimate.count}
@@ -191,7 +182,7 @@ class Image:
         if not broken:
             return None
         bad = np.argwhere(np.any([~np.isfinite(values) for values in broken.values()], axis=0))
-        y, x = (int(i) for i in bad[0])
+        y, x = bad[0].tolist()
         first = next(name for name, values in broken.items() if not np.isfinite(values[y, x]))
         more = f" and at {len(bad) - 1} more pixels" if len(bad) > 1 else ""
         others = f"; channels {', '.join(broken)}" if len(broken) > 1 else ""
@@ -212,11 +203,7 @@ def save_image(path: str | Path, image: Image) -> None:
 
 
 def load_image(path: str | Path) -> Image:
-    """Read an image: any OpenEXR file with R, G and B, or one written by `save_image`.
-
-    Raises RegressionError if the file cannot be read, channels are missing, or the number of samples or the variance is
-    impossible.
-    """
+    """Read an image: any OpenEXR file with R, G and B, or one written by `save_image`; else raise RegressionError."""
     channels, metadata, origin, has_data = _read(path)
     source = str(path)
     if (schema := metadata.get("schema", SCHEMA)) != SCHEMA:
@@ -271,8 +258,7 @@ def _named(prefix: str, values: NDArray[np.floating], names: Sequence[str] = RGB
 
 def _stacked(channels: Channels, prefix: str, names: Sequence[str], source: str) -> NDArray[np.float64]:
     expected = [f"{prefix}{name}" for name in names]
-    missing = [name for name in expected if name not in channels]
-    if missing:
+    if missing := [name for name in expected if name not in channels]:
         raise RegressionError(f'image "{source}" has no channel {", ".join(missing)}; expected {", ".join(expected)}')
     return np.stack([channels[name] for name in expected], axis=-1).astype(np.float64)
 
@@ -280,43 +266,40 @@ def _stacked(channels: Channels, prefix: str, names: Sequence[str], source: str)
 def _require_metadata(metadata: dict[str, Any], source: str) -> None:
     """Refuse metadata of another form than `save_image` writes. Any entry may be missing."""
 
-    def all_are_texts(value: Any, kind: type) -> bool:
-        values = value.values() if isinstance(value, dict) else value
-        return isinstance(value, kind) and all(isinstance(text, str) for text in values)
-
     def has_integers(value: Any, **least: int) -> bool:
         return isinstance(value, dict) and all(type(value.get(k)) is int and value[k] >= n for k, n in least.items())
 
     def is_sampling(value: Any) -> bool:
-        if not has_integers(value, seed=0, batch=1):
-            return False
         try:
             ends = [end for start, stop in value["batches"] for end in (start, stop)]
+            is_sorted = all(start < stop for start, stop in value["batches"]) and [0, *ends] == sorted([0, *ends])
         except (KeyError, TypeError, ValueError):
             return False
-        if not ends or any(type(end) is not int for end in ends) or [0, *ends] != sorted([0, *ends]):
-            return False
-        if any(start == stop for start, stop in value["batches"]):
+        if not ends or not is_sorted or any(type(end) is not int for end in ends):
             return False
         # Files of older versions have neither of these.
         counts = {"total": ends[-1], "passes": 1, **value}
-        return has_integers(counts, total=ends[-1], passes=1) and counts["passes"] <= counts["total"]
+        return has_integers(counts, seed=0, batch=1, total=ends[-1], passes=1) and counts["passes"] <= counts["total"]
 
-    forms = {
+    forms: dict[str, tuple[Callable[[Any], bool], str]] = {
         "sampling": (is_sampling, "a seed, the samples of a batch, and ranges of batches"),
         "paired": (lambda value: has_integers(value, seed=0, spp=1), "a seed and samples per pixel"),
-        **dict.fromkeys(("variant", "filter", "sampler"), (lambda value: isinstance(value, str), "a name")),
-        **dict.fromkeys(("channels", "shapes"), (lambda value: all_are_texts(value, list), "a list of names")),
         "sensor": (lambda value: has_integers({"sensor": value}, sensor=0), "a number from 0 on"),
         "tolerances": (lambda value: isinstance(value, dict), "numbers by name"),
+        **dict.fromkeys(("variant", "filter", "sampler"), (lambda value: isinstance(value, str), "a name")),
+        **dict.fromkeys(("channels", "shapes"), (lambda value: _are_texts(value, list), "a list of names")),
     }
     for name, what in {"files": "checksums", "parameters": "values", "environment": "versions"}.items():
-        forms[name] = (lambda value: all_are_texts(value, dict), f"{what} by name")
+        forms[name] = (lambda value: _are_texts(value, dict), f"{what} by name")
     for name, (is_right, expected) in forms.items():
         if name in metadata and not is_right(metadata[name]):
-            raise RegressionError(
-                f'metadata of image "{source}": {name} is {metadata[name]!s:.60}; expected {expected}'
-            )
+            found = f"{name} is {metadata[name]!s:.60}"
+            raise RegressionError(f'metadata of image "{source}": {found}; expected {expected}')
+
+
+def _are_texts(value: Any, kind: type) -> bool:
+    texts = value.values() if isinstance(value, dict) else value
+    return isinstance(value, kind) and all(isinstance(text, str) for text in texts)
 
 
 def write_exr(path: str | Path, pixels: NDArray[np.floating], metadata: dict | None = None) -> None:
@@ -325,13 +308,10 @@ def write_exr(path: str | Path, pixels: NDArray[np.floating], metadata: dict | N
 
 
 def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: dict | None = None) -> None:
-    """Write named channels into one single-part file; the file appears whole or not at all.
+    """Write named channels into a file of one part, as Mitsuba reads only the first; it appears whole or not at all.
 
-    The same channels and metadata give the same bytes. The file has one part, since Mitsuba reads only the first of
-    several, without a warning.
-
-    Integers become 32 bits unsigned, all else float32; a dot in a name makes a layer: ``variance.R``. Metadata are kept
-    as JSON, in the string attribute `METADATA_ATTRIBUTE`.
+    The same channels and metadata give the same bytes. Integers become 32 bits unsigned, all else float32; a dot in a
+    name makes a layer: ``variance.R``. Metadata are JSON, in the string attribute `METADATA_ATTRIBUTE`.
     """
     kinds = {name: np.uint32 if values.dtype.kind in "iu" else np.float32 for name, values in channels.items()}
     converted = {name: np.ascontiguousarray(values, dtype=kinds[name]) for name, values in channels.items()}
@@ -346,10 +326,8 @@ def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: 
 def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
     """Channels ``(height, width)`` by name of a file of one part, and its metadata, empty if there is none.
 
-    They show the display window, and are empty outside the data window: 0, and no shape.
-
-    Raises RegressionError if there is no such file, it is truncated or not an OpenEXR file, or it has several parts,
-    deep pixels or broken metadata.
+    They show the display window, and are empty outside the data window: 0, and no shape. Raises RegressionError if the
+    file cannot be read, or has several parts, deep pixels or broken metadata.
     """
     return _read(path)[:2]
 
@@ -372,9 +350,7 @@ def _read(path: str | Path) -> tuple[Channels, dict[str, Any], tuple[int, int], 
             begin = start.read(len(_GIT_LFS))
         is_exr = begin.startswith(_MAGIC)
         if begin == _GIT_LFS:
-            raise ContentElsewhere(
-                f'image "{path}" is a pointer of git-lfs without its pixels; get them by: git lfs pull'
-            )
+            raise ContentElsewhere(f'image "{path}" is a pointer of git-lfs without pixels; get them by: git lfs pull')
         raise RegressionError(f'image "{path}" {"is truncated, or damaged" if is_exr else "is not an OpenEXR file"}')
     if parts > 1:
         raise RegressionError(f'image "{path}" has {parts} parts; expected 1, as most programs read only the first')
@@ -401,7 +377,7 @@ def _read(path: str | Path) -> tuple[Channels, dict[str, Any], tuple[int, int], 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Close standard output and error while OpenEXR reads: of a damaged file, it writes a line for each row."""
+    """Close standard output and error while OpenEXR reads: it reports each row of a damaged file there."""
     with _quieting, open(os.devnull, "w") as nothing, redirect_stdout(nothing), ExitStack() as stack:
         with suppress(OSError):  # Where standard error is closed
             kept = os.dup(2)

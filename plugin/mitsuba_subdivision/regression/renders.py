@@ -27,8 +27,7 @@ from .image import NOTHING, Estimate, Image, Probe, combine, load_image, require
 from .scene import SEEDS, LoadedScene, SceneSource, load_scene, render_pixels
 from .tiers import Status, Tolerances
 
-# Samples per pixel of a batch, which is rendered at once with a seed of its own.
-BATCH = 64
+BATCH = 64  # Samples per pixel of a batch
 # Fewer batches than these measure the variance badly.
 LEAST_BATCHES = 4
 _OF_SAMPLING = ("seed", "batch", "total")
@@ -46,7 +45,7 @@ class Sampling:
 
     @classmethod
     def of_spp(cls, spp: int, batch: int = BATCH, seed: int = 0) -> Sampling:
-        """At least ``spp`` samples in whole batches, of which there are at least `LEAST_BATCHES`."""
+        """At least ``spp`` samples in whole batches, at least `LEAST_BATCHES`."""
         batch = min(batch, max(1, spp // LEAST_BATCHES))
         return cls(max(LEAST_BATCHES, -(-spp // batch)), batch, seed)
 
@@ -59,9 +58,8 @@ class Sampling:
         if not 1 <= number <= count:
             raise RegressionError(f"there is no pass {number} of {count}; expected 1 to {count}")
         if count > self.batches:
-            raise RegressionError(
-                f"{self.spp} samples in batches of {self.batch} make {self.batches} batches, fewer than {count} passes"
-            )
+            made = f"{self.spp} samples in batches of {self.batch} make {self.batches} batches"
+            raise RegressionError(f"{made}, fewer than {count} passes")
         return range((number - 1) * self.batches // count, number * self.batches // count)
 
 
@@ -157,7 +155,6 @@ def _require_same_image(first: Image, other: Image) -> None:
 
 
 def _joined(ordered: Sequence[Image]) -> list[list[int]]:
-    """Ranges of batches, where neighbouring ranges are joined."""
     joined: list[list[int]] = []
     ranges = [(*pair, image.name) for image in ordered for pair in image.metadata["sampling"]["batches"]]
     for start, stop, name in sorted(ranges):
@@ -200,7 +197,7 @@ def probe_scene(loaded: LoadedScene) -> Probe:
     )
     position, normal, uv = (np.where(valid, vector, 0).astype(np.float32) for vector in vectors)
     valid, triangle = valid[..., 0], np.where(valid, triangle, NOTHING)[..., 0].astype(np.uint32)
-    # Indices of the shapes, and faces of the cages of those that have one.
+    # Indices of shapes, and faces of their cages.
     shape, element = (np.full((height, width), NOTHING, dtype=np.uint32) for _ in range(2))
     for index, candidate in enumerate(shapes):
         at = valid & (identity == order[index]).reshape(height, width)
@@ -217,17 +214,11 @@ REFERENCE_SPP = 16384
 # The seeds of a test are this far from the reference's, so that the samples differ; those of other tests and of second
 # attempts are as far from each other.
 SEED_STEP = 2**20
-# Samples of the second attempt, in samples of the first.
-RETRY_FACTOR = 4
+RETRY_FACTOR = 4  # Samples of the second attempt, in samples of the first
 
 
-def as_reference(
-    image: Image,
-    scene: Path | None,  # The scene's file, if it has one
-    path: str | Path,  # Of the reference, in whose folder the command runs
-    tolerances: Tolerances,
-) -> Image:
-    """Make a reference of a finite image: its metadata get tolerances, and the command that makes it."""
+def as_reference(image: Image, scene: Path | None, path: str | Path, tolerances: Tolerances) -> Image:
+    """Add tolerances to a finite image, and the command that renders the scene's file to the reference's path again."""
     require_finite(image)
     limits, made_by = tolerances.as_dict(), image.metadata
     metadata, sampling = {**made_by, "tolerances": limits}, made_by["sampling"]
@@ -264,10 +255,9 @@ def sampling_of(reference: Image) -> Sampling:
     """Sampling of a reference. Raises UnusableReference if the reference does not record it."""
     sampling = reference.metadata.get("sampling")
     if reference.estimate is None or not isinstance(sampling, dict):
-        raise UnusableReference(
-            f'"{reference.name}" does not say how it was rendered; expected a reference, as '
-            f'"{PROGRAM} render SCENE -o REFERENCE.exr --reference" writes'
-        )
+        command = f"{PROGRAM} render SCENE -o REFERENCE.exr --reference"
+        what = f'"{reference.name}" does not say how it was rendered'
+        raise UnusableReference(f'{what}; expected a reference, as "{command}" writes')
     return Sampling(sum(stop - start for start, stop in sampling["batches"]), sampling["batch"], sampling["seed"])
 
 
@@ -322,7 +312,7 @@ def compare_scene(
 
     Where only the tile tier fails, chance may be the reason. A second attempt with new samples, four times as many,
     then decides. Where the paired tier warns, as on another machine, and no tier fails, the tile tier decides by all
-    samples of the reference, of which nearly no noise is left: it sees what the paired tier would have seen.
+    samples of the reference, which leave nearly no noise: it sees what the paired tier would have seen.
     """
     test = render_like(reference, source, spp, seed)
 

@@ -43,10 +43,9 @@ _MAPS = {
 
 
 def write_report(folder: str | Path, comparison: Comparison, title: str | None = None) -> Path:
-    """Write the report of a comparison: ``index.html``, which needs no other file, ``comparison.json``, ``maps.exr``.
+    """Write the report of a comparison, and return the path of its page, which needs no other file.
 
-    The title is by default the reference's name. Returns the path of the page.
-    Raises RegressionError if matplotlib is not installed.
+    The title is by default the reference's name. Raises RegressionError if matplotlib is not installed.
     """
     folder = Path(folder)
     title = title or comparison.reference.name
@@ -84,7 +83,6 @@ def srgb(pixels: NDArray[np.floating]) -> NDArray[np.floating]:
 
 
 def _panels(comparison: Comparison) -> bytes:
-    """Both images, their relative difference and the maps of the tiers, as a PNG file."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
@@ -96,18 +94,15 @@ def _panels(comparison: Comparison) -> bytes:
     rows, columns = -(-count // COLUMNS), min(COLUMNS, count)
     height = PANEL_INCHES * (a.shape[0] / a.shape[1] + 0.33)
     figure = Figure((columns * PANEL_INCHES, rows * height), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for panel in axes:
-        panel.set_anchor("N")
+    axes = figure.subplots(rows, columns, squeeze=False, subplot_kw={"anchor": "N"}).ravel()
     for panel in axes[count:]:
         panel.set_axis_off()
-
     peak = np.percentile(a[np.isfinite(a)], 99.5) if np.isfinite(a).any() else 1.0
     scale = 1 / peak if peak > 0 else 1.0
-    stops = f"sRGB at {np.log2(scale):+.1f} stops"
+    caption = f"sRGB at {np.log2(scale):+.1f} stops" + ("" if finite else ",\nnot finite in magenta")
     for panel, title, pixels in ((axes[0], "Reference", a), (axes[1], "Test", b)):
         panel.imshow(srgb(pixels * scale), interpolation="nearest")
-        _finish(panel, comparison, title, stops + ("" if finite else ",\nnot finite in magenta"))
+        _finish(panel, comparison, title, caption)
     for panel, (name, values) in zip(axes[2:], maps.items(), strict=False):
         _draw_map(panel, comparison, name, values)
     file = io.BytesIO()
@@ -123,13 +118,13 @@ def _maps(comparison: Comparison) -> dict[str, NDArray[np.floating]]:
             maps |= compare_flip(comparison.reference, comparison.test, comparison.tolerances).maps
     reference, test = comparison.reference, comparison.test
     others = {name: test.pixels[..., i] - reference.pixels[..., i] for i, name in enumerate(reference.names) if i > 2}
-    # Alpha, and those that differ most.
+    # Alpha, and the channels that differ most.
     order = sorted(others, key=lambda name: (name != "A", -np.abs(others[name]).mean()))
     return maps | {f"difference of {name}": others[name] for name in order[:MOST_OTHERS]}
 
 
 def _draw_map(panel: Axes, comparison: Comparison, name: str, values: NDArray[np.floating]) -> None:
-    """Draw a map with the meaning of its colours: grey where it has no value."""
+    """Draw a map with the meaning of its colours, grey where it has no value."""
     import matplotlib
     from matplotlib.colors import LogNorm, Normalize
     from matplotlib.patches import Rectangle
@@ -147,10 +142,8 @@ def _draw_map(panel: Axes, comparison: Comparison, name: str, values: NDArray[np
     colour_map = matplotlib.colormaps[colours].with_extremes(bad="0.55")
     picture = panel.imshow(np.ma.masked_invalid(values), colour_map, norm, interpolation="nearest")
     place: dict[str, Any] = {"location": "bottom", "shrink": 0.9, "aspect": 30, "pad": 0.02, "panchor": (0.5, 1.0)}
-    bar = panel.figure.colorbar(picture, ax=panel, **place)
-    bar.ax.tick_params(labelsize=7.5)
-    if name != "angle":
-        bar.locator = MaxNLocator(5)
+    ticks = None if name == "angle" else MaxNLocator(5)
+    panel.figure.colorbar(picture, ax=panel, ticks=ticks, **place).ax.tick_params(labelsize=7.5)
     tile = comparison.tier("tile")
     for place in tile.numbers["failing"] if tile and name in ("z", "evidence") else ():
         box = (place["x"] - 0.5, place["y"] - 0.5), place["width"], place["height"]
@@ -162,7 +155,6 @@ def _draw_map(panel: Axes, comparison: Comparison, name: str, values: NDArray[np
 
 
 def _finish(panel: Axes, comparison: Comparison, title: str, caption: str) -> None:
-    """Title and caption of a panel, and a circle around the worst pixel."""
     from matplotlib.patches import Ellipse
 
     panel.set_title(title, fontsize=10, fontweight="bold", loc="left")
@@ -182,6 +174,14 @@ def _page(title: str, comparison: Comparison, picture: bytes) -> str:
     remarks = "".join(f"<li>{html.escape(line)}" for line in comparison.remarks())
     marker = "Dashed circle: worst pixel. " if comparison.worst else ""
     width, height = comparison.reference.size
+    made = [
+        (role, key, value if isinstance(value := image.metadata[key], str) else json.dumps(value))
+        for role, image in (("reference", comparison.reference), ("test", comparison.test))
+        for key in ("variant", "filter", "sampler", "sensor", "sampling", "environment", "command")
+        if key in image.metadata
+    ]
+    how = "".join(f"<tr><th>{role}<td>{key}<td><code>{html.escape(text)}</code>" for role, key, text in made)
+    details = f"<details><summary>How the images were made</summary><table>{how}</table></details>" if made else ""
     body = (
         f"<h1>{html.escape(title)} {_badge(comparison.status.value)}</h1>"
         f"<p class=names>reference <code>{html.escape(comparison.reference.name)}</code>, "
@@ -189,21 +189,9 @@ def _page(title: str, comparison: Comparison, picture: bytes) -> str:
         f"<table class=tiers>{rows}</table><ul>{remarks}</ul>"
         f"<img src='data:image/png;base64,{base64.b64encode(picture).decode()}' alt='maps of the difference'>"
         f"<p class=foot>{marker}The numbers are in <a href='{NUMBERS}'>{NUMBERS}</a>, the maps at full precision in "
-        f"<a href='{MAPS}'>{MAPS}</a>.</p>{_how_made(comparison)}"
+        f"<a href='{MAPS}'>{MAPS}</a>.</p>{details}"
     )
     return _document(title, body)
-
-
-def _how_made(comparison: Comparison) -> str:
-    rows = []
-    for role, image in (("reference", comparison.reference), ("test", comparison.test)):
-        for key in ("variant", "filter", "sampler", "sensor", "sampling", "environment", "command"):
-            if key in image.metadata:
-                value: Any = image.metadata[key]
-                text = value if isinstance(value, str) else json.dumps(value)
-                rows.append(f"<tr><th>{role}<td>{key}<td><code>{html.escape(text)}</code>")
-    table = f"<table>{''.join(rows)}</table>"
-    return f"<details><summary>How the images were made</summary>{table}</details>" if rows else ""
 
 
 def _badge(status: str) -> str:
@@ -215,16 +203,10 @@ def _document(title: str, body: str) -> str:
 
 
 _STYLE = """<meta name=viewport content="width=device-width"><style>
-body { font: 15px/1.45 system-ui, sans-serif; color: #1d1d1f; background: #fff; margin: 2rem auto; max-width: 1180px;
-  padding: 0 1.5rem }
-h1 { font-size: 1.5rem; margin: 0 } img { max-width: 100% }
-.names, .foot { color: #57575c } .names { margin: .2rem 0 1.2rem }
-table { border-collapse: collapse; margin: .5rem 0 } td, th { text-align: left; vertical-align: top;
-  padding: .35rem 1rem .35rem 0; font-weight: normal } .tiers tr { border-top: 1px solid #e3e3e6 }
-.tiers th { font-weight: 600 } ul { margin: 1rem 0; padding-left: 1.2rem }
-.badge { font: 600 .8rem/1 system-ui, sans-serif; padding: .22em .6em; border-radius: .3em; vertical-align: middle;
-  text-transform: uppercase; letter-spacing: .03em }
-.pass { background: #d8f0de; color: #10562a } .fail { background: #fbdcd8; color: #8d1c10 }
-.warn { background: #fdedc8; color: #6c4a00 } .skipped { background: #e9e9ec; color: #4c4c52 }
-details { margin: 1rem 0 3rem; font-size: .85rem } code { font-size: .92em; overflow-wrap: anywhere }
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1180px; padding: 0 1.5rem }
+img { max-width: 100% } code { overflow-wrap: anywhere } details { font-size: .85rem }
+td, th { text-align: left; vertical-align: top; padding: .35rem 1rem .35rem 0 }
+.badge { font-size: .8rem; padding: .2em .6em; border-radius: .3em; text-transform: uppercase }
+.pass { background: #d8f0de } .fail { background: #fbdcd8 } .warn { background: #fdedc8 }
+.skipped { background: #e9e9ec } .names, .foot { color: #57575c }
 </style>"""

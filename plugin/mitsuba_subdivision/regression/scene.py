@@ -23,12 +23,11 @@ BOX = "box"
 # Path of an XML file, dictionary, or mi.Scene.
 # As text, since Mitsuba has no classes before a variant is set.
 SceneSource = Union[str, Path, Mapping[str, Any], "mi.Scene"]
-# Samples of a part, and the fewest samples per pixel of a part: with fewer, the weights of a wide reconstruction filter
-# would differ too much from part to part.
+# Samples of a part, and its fewest samples per pixel: with fewer, the weights of a wide reconstruction filter would
+# differ too much from part to part.
 PART_SAMPLES = 1 << 22
 LEAST_PART_SPP = 16
-# Seeds of Mitsuba have 32 bits.
-SEEDS = 2**32
+SEEDS = 2**32  # Seeds of Mitsuba have 32 bits
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +37,10 @@ class LoadedScene:
     scene: mi.Scene
     path: Path | None  # The scene's file; None for a scene from a dictionary or from memory
     filter: str  # Name of the film's reconstruction filter
-    # SHA-256 checksums of the scene's file and of all files that the scene names. Keys are paths relative to the
-    # scene's folder.
+    # SHA-256 checksums of the scene's file and of all files that the scene names, by paths from the scene's folder
     files: dict[str, str] = field(default_factory=dict)
-    parameters: dict[str, str] = field(default_factory=dict)  # Values of the scene file's parameters that were given
-    sensor_index: int = 0  # Which of the scene's sensors renders, from 0 on
+    parameters: dict[str, str] = field(default_factory=dict)  # Given values of parameters of the scene's file
+    sensor_index: int = 0
 
     @property
     def sensor(self) -> mi.Sensor:
@@ -68,26 +66,25 @@ class LoadedScene:
 
     @property
     def file_paths(self) -> list[Path]:
-        """The scene's file, and all files that the scene names."""
         return [self.path.resolve().parent / name for name in self.files] if self.path else []
 
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the image."""
-        width, height = self.sensor.film().crop_size()
-        return int(width), int(height)
+        return tuple(map(int, self.sensor.film().crop_size()))  # type: ignore[return-value] # two numbers
 
 
 @timed("Loading shapes and their hierarchy")
 def load_scene(
     source: SceneSource,
-    # Values for parameters of the file, which it declares by `<default name=".."/>`
     parameters: Mapping[str, Any] | None = None,
-    # Reconstruction filter to use instead of the film's own. With "box", the same seed gives the same bits.
     filter_name: str | None = None,
-    sensor_index: int = 0,  # Which of the scene's sensors renders, from 0 on
+    sensor_index: int = 0,
 ) -> LoadedScene:
-    """Load a scene in the current variant."""
+    """Load a scene in the current variant, with values for parameters of its file, for one of its sensors.
+
+    The filter replaces the film's own. With "box", the same seed gives the same bits.
+    """
     given = {name: str(value) for name, value in (parameters or {}).items()}
     source = Path(source) if isinstance(source, str) else source
     path = source if isinstance(source, Path) else None
@@ -151,7 +148,7 @@ def _file_resolver() -> Any:
 
 @contextmanager
 def kept_search_folders() -> Iterator[Any]:
-    """The folders that Mitsuba searches for files, which are restored afterwards."""
+    """Yield Mitsuba's file resolver, and restore its folders afterwards."""
     resolver = _file_resolver()
     before = [str(folder) for folder in resolver]
     try:
@@ -185,13 +182,11 @@ def _checksums(path: Path, state: mi.parser.ParserState) -> dict[str, str]:
         for key, value in node.props.items():
             if node.props.type(key) == mi.Properties.Type.String:
                 named = Path(str(_file_resolver().resolve(value)))
-                # Of a text longer than any name, `Path.is_file` raises an error.
+                # `Path.is_file` raises an error for a text that is longer than any name.
                 if value and os.path.isfile(named):
                     files.add(named.resolve())
-    return {
-        Path(os.path.relpath(file, folder)).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest()
-        for file in sorted(files)
-    }
+    digests = {file: hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(files)}
+    return {Path(os.path.relpath(file, folder)).as_posix(): digest for file, digest in digests.items()}
 
 
 def render_pixels(scene: mi.Scene, seed: int, spp: int, **options: Any) -> NDArray[np.float32]:
@@ -206,7 +201,7 @@ def render_parts(
 
     Part i of n has the seed ``seed * n + i``, so that images of several seeds share no samples.
     """
-    total: NDArray[np.float64] | float = 0.0
+    total: Any = 0.0
     with timed(what) as at:
         for index, spp in enumerate(parts):
             at(f"part {index + 1} of {len(parts)}")

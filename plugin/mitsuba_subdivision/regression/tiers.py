@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from . import RegressionError
 from .image import Estimate, Image, without_sample_counts
 
-__all__ = ["DEFAULT_TIERS", "TIERS", "Status", "TierResult", "Tolerances"]
-
 # Names, and what each compares.
 TIERS = {
     "probe": "what the rays through the centres of the pixels hit",
@@ -38,15 +36,13 @@ _SAME_SAMPLES, _IF_KNOWN = ("variant", "filter", "paired"), ("sampler", "sensor"
 SCALES: tuple[int | None, ...] = (4, 8, 16, None)
 # Samples that a reference should have for each of the test's, so that its own noise hardly counts.
 REFERENCE_SAMPLES = 16
-# Side of the tiles that tell how much noisier the test is than the reference.
-NOISE_TILE = 4
+NOISE_TILE = 4  # Side of the tiles that measure how much noisier the test is than the reference
 # Mitsuba's spectra of a colour miss it by up to this part of its largest value; measured for 18 colours.
 SPECTRA = 5e-4
 # Part of the variance that images with all samples in common keep at least. If all noise of a pixel is that of a single
 # bright path, and rounding sends it elsewhere, then the difference is 1 / sqrt(0.1) = 3.2 standard errors.
 LEAST_NOISE = 0.1
-# More degrees of freedom make no difference.
-_MOST_FREEDOM = 1e12
+_MOST_FREEDOM = 1e12  # More degrees of freedom make no difference
 
 # What FLIP's tone curve, ACES, maps to 0.85, the value that limits its exposures; and weights of R, G and B.
 _BRIGHT = 2.118872324
@@ -56,10 +52,9 @@ _MOST_STOPS = 12
 
 
 class Status(Enum):
-    """Outcome of a tier, or of a whole comparison."""
+    """Outcome of a tier, or of a whole comparison; the last one of several counts."""
 
-    # In the order of their weight. Skipped: the images lack what the tier compares.
-    SKIPPED = "skipped"
+    SKIPPED = "skipped"  # The images lack the tier's channels
     PASS = "pass"
     WARN = "warn"
     FAIL = "fail"
@@ -71,13 +66,10 @@ class TierResult:
 
     name: str
     status: Status
-    # The findings in words, the most important first, and for programs, as plain numbers, strings and lists.
-    lines: list[str]
-    numbers: dict[str, Any] = field(default_factory=dict)
-    # Row and column of the pixel that shows the difference best.
-    worst: tuple[int, int] | None = None
-    # Values of every pixel, (height, width), for the report.
-    maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)
+    lines: list[str]  # The findings in words, the most important first
+    numbers: dict[str, Any] = field(default_factory=dict)  # The findings as plain numbers, strings and lists
+    worst: tuple[int, int] | None = None  # Row and column of the pixel that shows the difference best
+    maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)  # (height, width) each, for the report
 
 
 @dataclass(frozen=True)
@@ -117,8 +109,7 @@ class Tolerances:
             raise RegressionError(f'tolerance "alpha" is {values["alpha"]}; expected a probability between 0 and 1')
         return replace(self, **{name: float(value) for name, value in values.items()})
 
-    def as_dict(self) -> dict[str, float]:
-        return asdict(self)
+    as_dict = asdict
 
 
 def pixel_of_largest(values: NDArray[np.floating]) -> tuple[int, int]:
@@ -126,14 +117,10 @@ def pixel_of_largest(values: NDArray[np.floating]) -> tuple[int, int]:
     return divmod(int(np.argmax(values)), values.shape[1])
 
 
-def _skipped(name: str, reason: str) -> TierResult:
-    return TierResult(name, Status.SKIPPED, [reason])
-
-
 def _skipped_without(name: str, reference: object | None, test: object | None, what: str) -> TierResult:
-    """Result of a tier that needs data of both images that at least one of them lacks."""
+    """Result of a tier that needs data of both images, where at least one of them lacks these."""
     lacking = "images have" if reference is test is None else "reference has" if reference is None else "test has"
-    return _skipped(name, f"the {lacking} no {what}")
+    return TierResult(name, Status.SKIPPED, [f"the {lacking} no {what}"])
 
 
 def compare_probes(reference_image: Image, test_image: Image, tolerances: Tolerances) -> TierResult:
@@ -201,10 +188,8 @@ def compare_probes(reference_image: Image, test_image: Image, tolerances: Tolera
 
 def normal_angle(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
     """Angle in degrees between unit vectors, accurate for tiny angles. Not a number where one of them is zero."""
-    a, b = a.astype(np.float64), b.astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
-        a = a / np.linalg.norm(a, axis=-1, keepdims=True)
-        b = b / np.linalg.norm(b, axis=-1, keepdims=True)
+        a, b = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (a.astype(np.float64), b.astype(np.float64)))
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
 
 
@@ -221,9 +206,8 @@ def compare_paired(reference: Image, test: Image, tolerances: Tolerances) -> Tie
     if reference.paired is None or test.paired is None:
         what = "first batch to pair (channels paired.R, paired.G, paired.B)"
         return _skipped_without("paired", reference.paired, test.paired, what)
-    reason = _different_samples(reference, test)
-    if reason:
-        return _skipped("paired", reason)
+    if reason := _different_samples(reference, test):
+        return TierResult("paired", Status.SKIPPED, [reason])
     difference = test.paired - reference.paired
     size = np.maximum(np.abs(reference.paired), DARK * levels(reference.paired))
     relative = np.abs(difference) / np.where(size > 0, size, 1)
@@ -249,9 +233,9 @@ def compare_paired(reference: Image, test: Image, tolerances: Tolerances) -> Tie
 
 
 def _noise_left(reference: Image, test: Image, estimate: Estimate) -> float:
-    """Part of both images' variance that their difference has: 1, or less if they have all samples in common.
+    """Part of both images' variance in their difference: 1, or less if they have all samples in common.
 
-    Rounding then sends a few paths elsewhere. How many, the first batches tell.
+    Rounding then sends a few paths elsewhere; the first batches show how many.
     """
     records = [image.metadata.get("sampling", {}) for image in (reference, test)]
     a, b = ([record.get(key) for key in ("seed", "batch", "batches")] for record in records)
@@ -278,17 +262,16 @@ def relative_difference(reference: NDArray[np.floating], test: NDArray[np.floati
 
 def _different_samples(reference: Image, test: Image) -> str | None:
     """Why the samples of two images are not the same, None if they are."""
-    silent = [role for role, image in (("reference", reference), ("test", test)) if "paired" not in image.metadata]
-    if silent:
-        return f"the {silent[0]} does not say with which seed its first batch was rendered"
+    for role, image in (("reference", reference), ("test", test)):
+        if "paired" not in image.metadata:
+            return f"the {role} does not say with which seed its first batch was rendered"
     keys = [*_SAME_SAMPLES, *(key for key in _IF_KNOWN if key in reference.metadata and key in test.metadata)]
     wanted, given = ({key: image.metadata.get(key) for key in keys} for image in (reference, test))
     for described in (wanted, given):
         # Older references have the sampler's numbers of samples, too.
         if sampler := described.get("sampler"):
             described["sampler"] = without_sample_counts(sampler)
-    different = _differences(wanted, given)
-    if different:
+    if different := _differences(wanted, given):
         return f"the samples are not the same: {'; '.join(different)}"
     if wanted["filter"] != "box":
         return f'filter "{wanted["filter"]}" adds samples in any order; expected "box"'
@@ -296,7 +279,6 @@ def _different_samples(reference: Image, test: Image) -> str | None:
 
 
 def _differences(reference: dict[str, Any], test: dict[str, Any]) -> list[str]:
-    """One phrase for each entry of two dictionaries that is not the same."""
     return [
         f"{key} {_in_words(test.get(key))} here, {_in_words(reference.get(key))} in the reference"
         for key in sorted({*reference, *test})
@@ -318,16 +300,15 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
     images that have their samples in common, the noise is what rounding leaves. `_z_scores` has the formulas.
 
     Single precision adds a bias, and so do spectra of colours: the standard error has a floor for that. Šidák's
-    correction covers the tiles and channels of a scale, Bonferroni's the scales and the scenes of a suite, of which
-    there are ``suite_size``.
+    correction covers the tiles and channels of a scale, Bonferroni's the scales and the scenes of a suite.
     """
     expected, tested = reference.estimate, test.estimate
     if expected is None or tested is None:
         return _skipped_without("tile", expected, tested, "channels variance.R, .G, .B and N")
     for estimate, role in ((expected, "reference"), (tested, "test")):
         if estimate.batches < 2:
-            return _skipped("tile", f"the {role} has one batch only, which gives no variance")
-    # Of `scipy.stats`, which has names for these, the import takes a second.
+            return TierResult("tile", Status.SKIPPED, [f"the {role} has one batch only, which gives no variance"])
+    # `scipy.stats` has names for these, but its import takes a second.
     from scipy.special import log_ndtr, ndtr
 
     left = _noise_left(reference, test, expected)
@@ -339,7 +320,7 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
     are_spectral = {"spectral" in image.metadata.get("variant", "") for image in (reference, test)}
     if len(are_spectral) > 1:
         floor[..., :3] += SPECTRA * np.abs(reference.rgb).max(axis=2, keepdims=True)
-    # Where the test is noisier in most tiles, it is so in those that missed rare paths.
+    # A test that is noisier in most tiles is so in tiles that missed rare paths.
     own, others = (_tile_sums(estimate.variance, NOISE_TILE) for estimate in (tested, expected))
     noisier = np.median(own[others > 0] / others[others > 0]) if others.any() else 1
     least = max(1.0, float(noisier)) * expected.variance
@@ -373,7 +354,7 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
         Status.FAIL if failing else Status.PASS,
         [f"noise explains every tile ({samples})"],
         {"scales": scales, "samples": spp, "failing": failing},
-        # Of the scale that shows the difference best, by its smallest probability in units of the limit.
+        # The scale with the smallest probability, in units of its limit, shows the difference best.
         maps={"z": strongest, "evidence": evidence[min(evidence)]},
     )
     if failing:
@@ -423,7 +404,6 @@ def _z_scores(
 
 
 def _tile_sums(values: NDArray[np.floating], side: int) -> NDArray[np.float64]:
-    """Sums of values ``(height, width, channels)`` over each tile."""
     rows, columns = (np.arange(0, length, side) for length in values.shape[:2])
     return np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1)
 
@@ -490,3 +470,11 @@ def _errors_of_others(reference: Image, test: Image) -> dict[str, NDArray[np.flo
         size = 1.0 if name.rpartition(".")[2] == "A" else np.maximum(np.maximum(a, b), least)
         errors[name] = np.abs(test.pixels[..., i] - reference.pixels[..., i]) / size
     return errors
+
+
+def compare_tier(name: str, reference: Image, test: Image, tolerances: Tolerances, suite_size: int) -> TierResult:
+    """Compare two images by a tier of `TIERS`."""
+    if name == "tile":
+        return compare_tiles(reference, test, tolerances, suite_size)
+    compared = {"probe": compare_probes, "paired": compare_paired, "flip": compare_flip}[name]
+    return compared(reference, test, tolerances)
