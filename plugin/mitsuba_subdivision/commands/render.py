@@ -104,10 +104,7 @@ _assignment = checked(lambda text: text.split("=", 1), lambda pair: len(pair) ==
 
 def render(parser: CommandParser) -> None:
     """Add the options of ``render``."""
-    parser.description = (
-        "Render a Mitsuba scene, which may have subdivision shapes; or a model, an OBJ, PLY or USD file, in a neutral "
-        "studio."
-    )
+    parser.description = "Render a Mitsuba scene; or a model, an OBJ, PLY or USD file, in a neutral studio."
     parser.epilog = TOLERANCES
     add = parser.add_argument
     add("scene", type=Path, metavar="FILE", help="Mitsuba scene (.xml), or a model: a control cage")
@@ -146,10 +143,7 @@ def render(parser: CommandParser) -> None:
     text = "normals: interpolated between vertices, or exact (default: auto, exact where supported)"
     add("--shading", choices=SHADINGS, help=text)
     add("--save-scene", type=Path, metavar="FILE", help="also write the scene as XML, which can be edited and rendered")
-    text = (
-        "Frames are written as NAME_0001.png and so on. Existing frames are kept, so that an interrupted command can "
-        "be repeated."
-    )
+    text = "Frames are named NAME_0001.png and so on. Existing ones are kept, so that an interrupted command can go on."
     add = parser.add_argument_group("frames of models", text).add_argument
     add("--turntable", type=positive, metavar="N", help="turn the model around once, in N frames")
     text = "times of a USD file, or numbers of files whose name has %%04d in it"

@@ -434,13 +434,9 @@ def compare_flip(reference: Image, test: Image, tolerances: Tolerances) -> TierR
     start, stop, count = flip_exposures(reference.rgb)
     # Arrays, since FLIP ends the process at files that it cannot read; nonnegative, since its tone curve has poles.
     arrays = [np.ascontiguousarray(np.maximum(image.rgb, 0), dtype=np.float32) for image in (reference, test)]
-    of_rgb, _, _ = flip_evaluator.evaluate(
-        *arrays,
-        "HDR",
-        applyMagma=False,
-        computeMeanError=False,
-        parameters={"startExposure": start, "stopExposure": stop, "numExposures": count, "tonemapper": "ACES"},
-    )
+    exposures = {"startExposure": start, "stopExposure": stop, "numExposures": count, "tonemapper": "ACES"}
+    without = {"applyMagma": False, "computeMeanError": False}
+    of_rgb, _, _ = flip_evaluator.evaluate(*arrays, "HDR", parameters=exposures, **without)
     errors = {"R, G, B": np.asarray(of_rgb, dtype=np.float64)[..., 0], **_errors_of_others(reference, test)}
     seen = reference.seen_with(test)
     means = {name: float(values[seen].mean()) for name, values in errors.items()}
