@@ -71,8 +71,7 @@ LABELS = {"cage": "cage", "refined": "coarse to fine", "mesh": "dense mesh"}
 LABEL = "#343d46"  # Behind numbers, as dark as the backdrop
 
 Panel = tuple[str, SceneNode]  # A title of two lines, and shapes to be rendered
-# A box and the sharpness of its edges, those of `cube` in their order.
-Box = tuple[ControlCage, NDArray[np.float64]]
+Box = tuple[ControlCage, NDArray[np.float64]]  # A box and the sharpness of its edges, those of `cube` in their order
 # The course of a fit: the loss before each step, and cages or triangles of a mesh after some steps.
 Course = tuple[list[float], dict[int, ControlCage]]
 

@@ -304,8 +304,7 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
     for estimate, role in ((expected, "reference"), (tested, "test")):
         if estimate.batches < 2:
             return TierResult("tile", Status.SKIPPED, [f"the {role} has one batch only, which gives no variance"])
-    # `scipy.stats` has names for these, but its import takes a second.
-    from scipy.special import log_ndtr, ndtr
+    from scipy.special import log_ndtr, ndtr  # `scipy.stats` has names for these, but its import takes a second
 
     left = _noise_left(reference, test, expected)
     expected, tested = (replace(estimate, variance=left * estimate.variance) for estimate in (expected, tested))
