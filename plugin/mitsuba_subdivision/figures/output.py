@@ -93,7 +93,8 @@ def panels(options: FigureOptions, rows: int, columns: int, **more: Any) -> tupl
     from matplotlib import pyplot
 
     # Room for panels that are twice as high as wide.
-    size = np.array([1, 2 * rows / columns]) * options.width / INCH + [0, 1]
+    width = options.width / INCH
+    size = (width, 1 + 2 * rows * width / columns)
     return pyplot.subplots(rows, columns, figsize=size, layout="compressed", squeeze=False, **more)
 
 
