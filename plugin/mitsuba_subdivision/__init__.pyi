@@ -3,10 +3,7 @@
 from mitsuba_usd import usd_scene as usd_scene
 
 from . import fit as fit
-from .cage import Attribute as Attribute
-from .cage import CageError as CageError
-from .cage import CageWarning as CageWarning
-from .cage import ControlCage as ControlCage
+from .cage import Attribute as Attribute, CageError as CageError, CageWarning as CageWarning, ControlCage as ControlCage
 from .device_arrays import upload as upload
 from .evaluation.element import limit_stencil as limit_stencil
 from .evaluation.scheme_laws import check_scheme as check_scheme
@@ -15,19 +12,13 @@ from .patches.closest_points import ClosestPoints as ClosestPoints
 from .patches.patch_samples import StencilMatrices as StencilMatrices
 from .patches.polynomial_pieces import ElementBounds as ElementBounds
 from .refinement.cage_refinement import CageRefinement as CageRefinement
-from .schemes import SchemeError as SchemeError
-from .schemes import register_scheme as register_scheme
-from .shapes import register as register
-from .shapes import register_variant as register_variant
+from .schemes import SchemeError as SchemeError, register_scheme as register_scheme
+from .shapes import register as register, register_variant as register_variant
 from .shapes.derivatives import loss_of_views as loss_of_views
 from .shapes.parameters import pixel_error_for as pixel_error_for
-from .studio import render_denoised as render_denoised
-from .studio import studio_scene as studio_scene
-from .studio import weigh_lights as weigh_lights
-from .surface import LimitSurface as LimitSurface
-from .surface import SurfaceSamples as SurfaceSamples
-from .tessellation.vertex_table import Tessellation as Tessellation
-from .tessellation.vertex_table import VertexMatrices as VertexMatrices
+from .studio import render_denoised as render_denoised, studio_scene as studio_scene, weigh_lights as weigh_lights
+from .surface import LimitSurface as LimitSurface, SurfaceSamples as SurfaceSamples
+from .tessellation.vertex_table import Tessellation as Tessellation, VertexMatrices as VertexMatrices
 
 __version__: str
 

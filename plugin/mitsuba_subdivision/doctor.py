@@ -24,8 +24,7 @@ SECONDS = 120  # Starting Mitsuba on a slow disk takes some seconds, and a GPU's
 # Height of the limit surface of a cube with corners at -1 and 1, above the middle of its face: the limit mask there,
 # applied to the vertices of the cube refined once.
 CUBE_HEIGHT = 68 / 81
-# Half the side of the pixel, so small that the height is the same all over it.
-_PIXEL = 1e-6
+_PIXEL = 1e-6  # Half the side of the pixel, so small that the height is the same all over it
 TOLERANCE = 1e-5
 _CHILD = "import json, sys; from mitsuba_subdivision import doctor; print(json.dumps(doctor._report(sys.argv[1])))"
 

@@ -1,4 +1,4 @@
-"""What a control cage is made of, what its surface will cost, and what about it will look odd."""
+"""Elements of a control cage, the cost of its surface, and its visible defects."""
 
 from __future__ import annotations
 
@@ -154,10 +154,8 @@ def _warnings(surface: LimitSurface) -> Iterator[str]:
         yield f"{unused:,} vertices belong to no face"
     triangles = np.count_nonzero(cage.face_sizes == 3)
     if scheme.name == "catmull_clark" and triangles > cage.face_count / 2:
-        yield (
-            f"{triangles:,} of {cage.face_count:,} faces are triangles, on which Catmull-Clark ripples; Loop is made "
-            'for them, and triangle_rule "smooth" helps'
-        )
+        ripples = f"{triangles:,} of {cage.face_count:,} faces are triangles, on which Catmull-Clark ripples"
+        yield f'{ripples}; Loop is made for them, and triangle_rule "smooth" helps'
     if low := np.count_nonzero(inner & (t.vertex_face_count == 2)):
         yield f"{low:,} inner vertices have valence 2, where the surface has a normal but does not turn to it smoothly"
     if (high := int(t.vertex_face_count[inner].max(initial=0))) > HIGH_VALENCE:

@@ -38,14 +38,9 @@ def mitsuba_mesh(
     for key, part in parts.items():
         if part is not None:
             properties[key] = part
-    mesh = mi.Mesh(
-        name,
-        len(buffers["vertex_positions"]),
-        len(triangles),
-        props=properties,
-        has_vertex_normals=averages_normals or "vertex_normals" in buffers,
-        has_vertex_texcoords="vertex_texcoords" in buffers,
-    )
+    has_normals, has_uv = averages_normals or "vertex_normals" in buffers, "vertex_texcoords" in buffers
+    given: dict[str, Any] = {"props": properties, "has_vertex_normals": has_normals, "has_vertex_texcoords": has_uv}
+    mesh = mi.Mesh(name, len(buffers["vertex_positions"]), len(triangles), **given)
     for key, values in buffers.items():
         if key not in _BUFFERS:
             mesh.add_attribute(key, values.shape[1], [0.0] * values.size)

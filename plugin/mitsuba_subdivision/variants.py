@@ -15,8 +15,7 @@ from .llvm import best_variant, llvm_problem, loaded_version, require_llvm
 # The module of a variant, such as mitsuba.llvm_ad_rgb. For mypy, a class of a `ModuleType` is no base class.
 Variant: TypeAlias = Any
 SceneNode = dict[str, Any]  # A scene or an entry of one, as `mi.load_dict` takes it
-# Threads with which Mitsuba reads and writes OpenEXR files: one that waits, and one that works.
-OPENEXR_THREADS = 2
+OPENEXR_THREADS = 2  # Mitsuba reads and writes OpenEXR files by one thread that waits, and one that works
 EXPECTED = 'the module mitsuba with a variant set, a variant such as mitsuba.llvm_ad_rgb, or its name, "llvm_ad_rgb"'
 
 
@@ -128,7 +127,7 @@ def environment(variant: str) -> dict[str, str]:
     import numpy
     import scipy
 
-    # Not of this package: its changes are what the tests of renders are for.
+    # Without this package: tests of renders are for its changes.
     versions = {module.__name__: str(module.__version__) for module in (mitsuba, drjit, numpy, scipy)}
     versions["processor"] = _processor()
     if variant.startswith("llvm"):

@@ -31,12 +31,8 @@ def parser(
     words: Sequence[str] = tuple(COMMANDS),  # Of the command line: only commands named there get options
 ) -> CommandParser:
     """The parser of the whole command line."""
-    program = CommandParser(
-        prog=PROGRAM,
-        description="Exact subdivision surfaces for Mitsuba 3.",
-        allow_abbrev=False,
-        epilog=f'"{PROGRAM} COMMAND --help" describes a command.',
-    )
+    about, hint = "Exact subdivision surfaces for Mitsuba 3.", f'"{PROGRAM} COMMAND --help" describes a command.'
+    program = CommandParser(prog=PROGRAM, description=about, allow_abbrev=False, epilog=hint)
     program.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     program.set_defaults(error_status=1)
     commands = program.add_subparsers(title="commands", required=True, metavar="COMMAND")

@@ -35,14 +35,12 @@ def compare(parser: CommandParser) -> None:
     add = parser.add_argument
     add("reference", type=Path, metavar="REFERENCE", help="OpenEXR file")
     add("test", type=Path, metavar="TEST", help="OpenEXR file, or a Mitsuba scene (.xml) to render")
-    text = (
-        f"tiers to compare by, separated by commas (default: {', '.join(DEFAULT_TIERS)}, as far as the images allow; "
-    )
-    add("--tiers", metavar="TIERS", help=f"{text}flip if no other can compare their pixels)")
+    default = f"default: {', '.join(DEFAULT_TIERS)} as far as images allow; flip if no other compares pixels"
+    add("--tiers", metavar="TIERS", help=f"tiers to compare by, separated by commas ({default})")
     add("--spp", type=positive, metavar="N", help="samples per pixel of a scene (default: 256)")
     add("--seed", type=seed, metavar="N", help="other samples of a scene for each N (default: 0)")
     add_tolerances(parser, "tolerance to use instead of the reference's; can be repeated")
-    text = "what channels mean that only one image has: a file that gains a layer shows the same picture"
+    text = "effect of channels that only one image has: a file that gains a layer shows the same picture"
     add("--missing-channels", choices=list(MISSING), default="warn", help=f"{text} (default: %(default)s)")
     add("--json", metavar="FILE", help='write the numbers as JSON; "-" is standard output')
     add("--html", type=Path, metavar="DIR", help="folder to write a report to")

@@ -20,9 +20,7 @@ WIDEST = 1200.0  # Millimetres, for posters
 
 def figure(parser: CommandParser) -> None:
     """Add the options of ``figure``."""
-    parser.description = (
-        "Draw a figure of the documentation, or all. Options that do not change the figure are refused."
-    )
+    parser.description = "Draw a figure of the documentation, or all. Options without effect on it are refused."
     parser.epilog = table("figures", {name: figure.shows for name, figure in FIGURES.items()})
     add = parser.add_argument
     add("name", choices=[*FIGURES, "all"], metavar="NAME", help='a figure below, or "all"')

@@ -16,10 +16,7 @@ from .arguments import CommandParser, add_cage_options
 
 def info(parser: CommandParser) -> None:
     """Add the options of ``info``."""
-    parser.description = (
-        "Describe a control cage: its elements, the cost of its limit surface, and defects that will be visible on the "
-        "surface."
-    )
+    parser.description = "Describe a control cage: its elements, the cost of its surface, and visible defects."
     _add_cage(parser)
     parser.add_argument("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=_info)

@@ -44,12 +44,6 @@ from .compare import TOLERANCES, add_tolerances
 
 IMAGE_SUFFIXES, VIDEO_SUFFIXES, SCENE_SUFFIX = (".exr", ".png", ".jpg", ".hdr"), (".gif", ".mp4"), ".xml"
 DEFAULT_FPS = 24
-# Options about models, by the names that they have after parsing; others are about every scene.
-_OF_MODELS = (
-    "view", "azimuth", "elevation", "up", "size", "scheme", "prim", "time", "rate", "shading", "checker", "cage",
-    "texture_size", "camera", "over", "environment", "no_studio", "transparent", "aovs",
-)  # fmt: skip
-_OF_FRAMES = ("turntable", "frames", "shutter", "fps")
 # Options that select one mesh of a USD file, and those of whole ones.
 _OF_ONE_MESH = ("up", "scheme", "prim", "checker", "cage")
 _OF_STAGES = ("shutter", "texture_size", "camera", "over")
@@ -119,10 +113,7 @@ _assignment = checked(lambda text: text.split("=", 1), lambda pair: len(pair) ==
 
 def render(parser: CommandParser) -> None:
     """Add the options of ``render``."""
-    parser.description = (
-        "Render a Mitsuba scene, which may have subdivision shapes; or a model, an OBJ, PLY or USD file, in a neutral "
-        "studio."
-    )
+    parser.description = "Render a Mitsuba scene; or a model, an OBJ, PLY or USD file, in a neutral studio."
     parser.epilog = TOLERANCES
     add = parser.add_argument
     add("scene", type=Path, metavar="FILE", help="Mitsuba scene (.xml), or a model: a control cage")
@@ -163,11 +154,9 @@ def render(parser: CommandParser) -> None:
     text = "normals: interpolated between vertices, or exact (default: auto, exact where supported)"
     add("--shading", choices=SHADINGS, help=text)
     add("--save-scene", type=Path, metavar="FILE", help="also write the scene as XML, which can be edited and rendered")
-    text = (
-        "Frames are written as NAME_0001.png and so on. Existing frames are kept, so that an interrupted command can "
-        "be repeated."
-    )
-    add = parser.add_argument_group("frames of models", text).add_argument
+    text = "Frames are named NAME_0001.png and so on. Existing ones are kept, so that an interrupted command can go on."
+    frames = parser.add_argument_group("frames of models", text)
+    add = frames.add_argument
     add("--turntable", type=positive, metavar="N", help="turn the model around once, in N frames")
     text = "times of a USD file, or numbers of files whose name has %%04d in it"
     add("--frames", type=_frame_range, metavar="FIRST:LAST[:STEP]", help=text)
@@ -190,7 +179,8 @@ def render(parser: CommandParser) -> None:
     text = 'write a reference for "compare": with the box filter, geometry AOVs and tolerances'
     add("--reference", action="store_true", help=text)
     add_tolerances(passes, "tolerance to store with the reference; can be repeated")
-    parser.set_defaults(run=_render)
+    of_models = [action.dest for group in (models, frames) for action in group._group_actions]
+    parser.set_defaults(run=_render, of_models=of_models)
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -249,7 +239,7 @@ def _is_stage(options: argparse.Namespace) -> bool:
 
 
 def _require_effect(options: argparse.Namespace, is_model: bool) -> None:
-    what, useless = ("model", _OF_SCENES) if is_model else ("scene", (*_OF_MODELS, *_OF_FRAMES, "save_scene"))
+    what, useless = ("model", _OF_SCENES) if is_model else ("scene", options.of_models)
     other = "a Mitsuba scene, which --save-scene writes" if is_model else "a model"
     for name in useless:
         given = getattr(options, name)
@@ -550,8 +540,7 @@ def _require_encoder(path: Path) -> None:
 def _write_video(path: Path, frames: Sequence[Path], fps: float) -> None:
     import imageio.v2 as imageio
 
-    # A GIF file repeats for ever, and its durations are milliseconds.
-    is_gif = path.suffix.lower() == ".gif"
+    is_gif = path.suffix.lower() == ".gif"  # A GIF file repeats for ever, and its durations are milliseconds
     settings: dict[str, Any] = {"duration": 1000 / fps, "loop": 0} if is_gif else {"fps": fps, "macro_block_size": EVEN}
     with whole_file(path) as beside:
         video: Any = imageio.get_writer(beside, **settings)

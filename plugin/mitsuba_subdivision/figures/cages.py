@@ -27,8 +27,7 @@ RADIUS = 1.9  # The ball that fills the picture, for cages of users
 REGULAR, IRREGULAR = (0.9, 0.9, 0.89), (0.22, 0.24, 0.27)
 # Segments of an edge of level 0, whose ends are tested for visibility; an edge of the next level has half as many.
 EDGE_SEGMENTS = 24
-# Segments per edge of a patch of the last level, for its area and for the render of the limit surface.
-RATE = 6
+RATE = 6  # Segments per edge of a patch of the last level, for its area and for the render of the limit surface
 
 
 def draw_subdivision(options: FigureOptions) -> list[Path]:

@@ -37,7 +37,7 @@ CHILD_COLOURS = ("#747b84", "#fcebbc", "#e39360", "#b3d3e0")
 CONTROL_EDGE, NEW_EDGE = "#8d97a1", "#3f5b6b"
 DECIMALS = 9  # Stencils that agree so far are the same: their entries are fractions of small integers
 VALENCES = (3, 4, 5, 4)  # Faces around the corners of the tree's face; two corners are extraordinary
-# Regular leaves, and those of each level around an extraordinary vertex; what is below is grey.
+# Colours of regular leaves and of leaves at each level around an extraordinary vertex; grey for deeper ones.
 LEAF_COLOURS, REST = ("#fcfcd0", "#b9dfa8", "#63b7b3", "#2a7fb0"), "#8d97a1"
 SLACK = 0.15  # Stiffness of springs along the edges of the tree's face, relative to other edges
 LINE = "#2d3a45"

@@ -39,10 +39,8 @@ COARSE, DENSE, FINE = 2, 5, 6  # How often a cube is halved to be the cage, the 
 # λ of large steps, and Adam's first and last learning rates, in diagonals: the best of several.
 SMOOTHING, MESH_SMOOTHING = 1.0, 19.0
 RATES, MESH_RATES = (0.1, 0.006), (0.25, 0.01)
-# Steps after which distances are measured, even on a logarithmic axis; samples of each surface, and segments of a
-# cage's edges there.
-MEASURED: list[int] = np.unique(np.rint(np.geomspace(1, STEPS, 16)).astype(int)).tolist()
-SAMPLES, SEGMENTS = 30_000, 6
+# How often distances are measured; samples of each surface, and segments of a cage's edges there.
+MEASUREMENTS, SAMPLES, SEGMENTS = 16, 30_000, 6
 REFINED, SHOWN = 0.3, (0.09, 0.29)  # Parts of the steps before the cage is refined, and shown on its way
 
 SIDE, SIDES = 1.24, (1.25, 1.0, 0.85)  # Sides of the initial cube, and of the box as multiples
@@ -73,8 +71,7 @@ LABELS = {"cage": "cage", "refined": "coarse to fine", "mesh": "dense mesh"}
 LABEL = "#343d46"  # Behind numbers, as dark as the backdrop
 
 Panel = tuple[str, SceneNode]  # A title of two lines, and shapes to be rendered
-# A box and the sharpness of its edges, those of `cube` in their order.
-Box = tuple[ControlCage, NDArray[np.float64]]
+Box = tuple[ControlCage, NDArray[np.float64]]  # A box and the sharpness of its edges, those of `cube` in their order
 # The course of a fit: the loss before each step, and cages or triangles of a mesh after some steps.
 Course = tuple[list[float], dict[int, ControlCage]]
 
@@ -151,6 +148,11 @@ def _views_of(shape: mi.Shape, pixels: int) -> list[View]:
     return views
 
 
+def _measured_steps() -> list[int]:
+    """Steps after which the distance to the target is measured, evenly on a logarithmic axis."""
+    return sorted(set(np.rint(np.geomspace(1, STEPS, MEASUREMENTS)).astype(int).tolist()))
+
+
 def _fit_cage(refine: list[int], views: list[View]) -> Course:
     fit = CageFit(
         ball_cage(COARSE, RADIUS),
@@ -163,7 +165,7 @@ def _fit_cage(refine: list[int], views: list[View]) -> Course:
         spp=SPP,
     )
     cages = {0: fit.cage}
-    for step in MEASURED:
+    for step in _measured_steps():
         cages[step] = fit.run(step - len(fit.losses)).cage
     return fit.losses, cages
 
@@ -194,7 +196,7 @@ def _fit_mesh(views: list[View]) -> Course:
         optimizer.set_learning_rate(rate(step) * DIAGONAL)
         optimizer.step()
         losses.append(float(np.array(loss).item()) / len(views))
-        if step + 1 in MEASURED:
+        if step + 1 in _measured_steps():
             with dr.suspend_grad():
                 meshes[step + 1] = mesh.with_positions(rows(large_steps.from_differential(optimizer["u"])))
     return losses, meshes

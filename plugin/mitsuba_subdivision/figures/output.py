@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
 # Widths of a page and of one of its two columns in millimetres. Panels get fewer columns below BETWEEN.
 PAGE, COLUMN, BETWEEN, INCH = 178.0, 84.0, 120.0, 25.4
-# Room around a figure in inches, and how often it is laid out to leave no more than this.
-PAD, LAYOUTS = 0.02, 8
+PAD, LAYOUTS = 0.02, 8  # Room around a figure in inches, and how often it is laid out to leave no more than this
 # Sizes of text in points at a column and at a page: exponents and indices are characters of the same size.
 TEXT_SIZES = (6.0, 7.0)
 # Colours and markers of series, which differ in grey and for colour-blind readers. None is red, the colour of
@@ -94,7 +93,8 @@ def panels(options: FigureOptions, rows: int, columns: int, **more: Any) -> tupl
     from matplotlib import pyplot
 
     # Room for panels that are twice as high as wide.
-    size = np.array([1, 2 * rows / columns]) * options.width / INCH + [0, 1]
+    width = options.width / INCH
+    size = (width, 1 + 2 * rows * width / columns)
     return pyplot.subplots(rows, columns, figsize=size, layout="compressed", squeeze=False, **more)
 
 

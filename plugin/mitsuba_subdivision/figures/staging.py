@@ -33,7 +33,7 @@ REFINEMENTS = 2  # Isolate every extraordinary vertex
 FAR = 4
 # Sizes of a cage that stands before a camera, the largest first, and what stays free at each side of the picture.
 SCALES, MARGIN = np.geomspace(4, 0.4, 100), 0.04
-SMALLEST = 1e-300  # What the size of a cage without one counts as
+SMALLEST = 1e-300  # Size of a cage in one point
 
 
 def load_stage(name: str, **parameters: str | float) -> mi.Scene:

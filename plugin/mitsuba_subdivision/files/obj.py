@@ -23,8 +23,7 @@ from ..mesh.connectivity import IntArray
 from ..whole_file import whole_file
 from .formats import Triangles, faces_by_name, warn_of_losses
 
-# Rows that are turned into text at once, which bounds the memory for numbers as Python objects.
-ROWS = 1 << 16
+ROWS = 1 << 16  # Turned into text at once: bounds the memory for numbers as Python objects
 _SPACE, _NEWLINE = b" \n"
 _COMMENT = re.compile(rb"#[^\n]*")
 # The name of a material may have a "#" in it, but for one between spaces.

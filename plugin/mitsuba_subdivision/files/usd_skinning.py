@@ -20,7 +20,7 @@ class Skinning:
     def __init__(
         self,
         time: Usd.TimeCode,
-        report: Callable[[str, object], None],  # Gets what is ignored, and the path of the mesh
+        report: Callable[[str, object], None],  # Gets messages, and the path of the mesh
     ) -> None:
         from pxr import UsdGeom, UsdSkel
 

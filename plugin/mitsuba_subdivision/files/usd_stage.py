@@ -33,7 +33,7 @@ INTERPOLATIONS: dict[str, Interpolation] = {"vertex": "vertex", "varying": "vary
 TEXCOORDS = ("st", "UVMap", "texcoords")
 HIDDEN_PURPOSES = ("guide", "proxy")  # Values of purpose for prims that renderers do not show
 ALL = "*"  # Value of `prim` that selects every mesh in the file
-# Characters of a message of the USD library that are shown, and that are searched for a reason.
+# Characters of the USD library's messages to show, and to search for a reason.
 _MOST_SHOWN, _MOST_SEARCHED = 200, 10_000
 _MATERIALX = re.compile(r"Could not open asset @([^@]*\.mtlx)[@:]", re.IGNORECASE)
 
@@ -168,8 +168,7 @@ def usd_messages_of(name: str) -> Iterator[None]:
     """
     from pxr import UsdUtils
 
-    # While it exists, it takes the messages of all threads.
-    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # While it exists, it takes the messages of all threads
     try:
         yield
         reports = delegate.TakeUncoalescedDiagnostics()

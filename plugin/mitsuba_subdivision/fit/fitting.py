@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 # A loss has stopped falling when its means over this many steps and over as many before differ by less than this part.
 STEPS_OF_MEAN, LEAST_FALL = 10, 0.02
 
-# Layout of checkpoints, and what their numbers mean: those of control points depend on λ of large steps.
-FORMAT = 2
+FORMAT = 2  # Layout of checkpoints, and what their numbers mean: those of control points depend on λ of large steps
 
 State = Mapping[str, NDArray]  # What steps have changed: arrays by their names, "variable: field"
 # A number, or what users may give instead.

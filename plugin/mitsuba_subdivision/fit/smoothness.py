@@ -101,7 +101,7 @@ def quadratic_form(name: str, start: LimitSurface) -> tuple[sparse.csr_array, Fl
 
 
 def regularizer(name: str, start: LimitSurface) -> Callable[[dr.ArrayBase], mi.Float]:
-    """Term that keeps a cage even, as a loss of control points on the device, for optimisations of one's own.
+    """Term that keeps a cage even, as a loss of control points on the device, for other optimisations.
 
     Parameters
     ----------

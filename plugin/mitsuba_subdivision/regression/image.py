@@ -277,8 +277,7 @@ def _require_metadata(metadata: dict[str, Any], source: str) -> None:
             return False
         if not ends or not is_sorted or any(type(end) is not int for end in ends):
             return False
-        # Files of older versions have neither of these.
-        counts = {"total": ends[-1], "passes": 1, **value}
+        counts = {"total": ends[-1], "passes": 1, **value}  # Files of older versions have neither of these
         return has_integers(counts, seed=0, batch=1, total=ends[-1], passes=1) and counts["passes"] <= counts["total"]
 
     forms: dict[str, tuple[Callable[[Any], bool], str]] = {
@@ -340,8 +339,7 @@ def _read(path: str | Path) -> tuple[Channels, dict[str, Any], tuple[int, int], 
     try:
         with _quiet(), OpenEXR.File(str(path), separate_channels=True) as file:
             parts = len(file.parts)
-            # A file whose pixels cannot be read has none.
-            header = dict(file.header()) if parts == 1 else {}
+            header = dict(file.header()) if parts == 1 else {}  # A file whose pixels cannot be read has none
             channels = {n: np.array(c.pixels) for n, c in file.channels().items()} if parts == 1 else {}
     except (RuntimeError, ValueError, OSError):
         parts = 0

@@ -24,11 +24,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 PAGE, NUMBERS, MAPS = "index.html", "comparison.json", "maps.exr"
-# Panels of channels besides R, G and B.
-MOST_OTHERS = 4
+MOST_OTHERS = 4  # Panels of channels besides R, G and B
 COLUMNS, PANEL_INCHES, DOTS_PER_INCH = 4, 2.9, 160
-# Degrees that the first and the last colour stand for.
-ANGLES = (1e-5, 10.0)
+ANGLES = (1e-5, 10.0)  # Degrees of the first and of the last colour
 _SIGNED = "RdBu_r"
 # Title, caption and colours of each map; what the colours reach at least, so that rounding stays pale; and the
 # percentile that they reach.

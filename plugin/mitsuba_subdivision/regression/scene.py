@@ -71,7 +71,8 @@ class LoadedScene:
     @property
     def size(self) -> tuple[int, int]:
         """Width and height of the image."""
-        return tuple(map(int, self.sensor.film().crop_size()))  # type: ignore[return-value] # two numbers
+        width, height = self.sensor.film().crop_size()
+        return int(width), int(height)
 
 
 @timed("Loading shapes and their hierarchy")
@@ -100,14 +101,12 @@ def load_scene(
     if not 0 <= sensor_index < count:
         sensors = "one sensor, 0" if count == 1 else f"sensors 0 to {count - 1}"
         raise RegressionError(f"there is no sensor {sensor_index}; the scene has {sensors}")
-    # By the class that the filter prints: "BoxFilter[]" is "box".
     film = scene.sensors()[sensor_index].film()
+    # The class that the filter prints, "BoxFilter[]", names "box".
     filter_of_scene = str(film.rfilter()).partition("[")[0].removesuffix("Filter").lower()
     if isinstance(source, mi.Scene) and filter_name not in (None, filter_of_scene):
-        raise RegressionError(
-            f'the loaded scene has the reconstruction filter "{filter_of_scene}"; expected "{filter_name}", which '
-            "a scene given as a file or a dictionary gets"
-        )
+        expected = f'expected "{filter_name}", which a scene given as a file or a dictionary gets'
+        raise RegressionError(f'the loaded scene has the reconstruction filter "{filter_of_scene}"; {expected}')
     return LoadedScene(scene, path, filter_of_scene, files, given, sensor_index)
 
 

@@ -308,8 +308,7 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
     for estimate, role in ((expected, "reference"), (tested, "test")):
         if estimate.batches < 2:
             return TierResult("tile", Status.SKIPPED, [f"the {role} has one batch only, which gives no variance"])
-    # `scipy.stats` has names for these, but its import takes a second.
-    from scipy.special import log_ndtr, ndtr
+    from scipy.special import log_ndtr, ndtr  # `scipy.stats` has names for these, but its import takes a second
 
     left = _noise_left(reference, test, expected)
     expected, tested = (replace(estimate, variance=left * estimate.variance) for estimate in (expected, tested))
@@ -438,13 +437,9 @@ def compare_flip(reference: Image, test: Image, tolerances: Tolerances) -> TierR
     start, stop, count = flip_exposures(reference.rgb)
     # Arrays, since FLIP ends the process at files that it cannot read; nonnegative, since its tone curve has poles.
     arrays = [np.ascontiguousarray(np.maximum(image.rgb, 0), dtype=np.float32) for image in (reference, test)]
-    of_rgb, _, _ = flip_evaluator.evaluate(
-        *arrays,
-        "HDR",
-        applyMagma=False,
-        computeMeanError=False,
-        parameters={"startExposure": start, "stopExposure": stop, "numExposures": count, "tonemapper": "ACES"},
-    )
+    exposures = {"startExposure": start, "stopExposure": stop, "numExposures": count, "tonemapper": "ACES"}
+    without = {"applyMagma": False, "computeMeanError": False}
+    of_rgb, _, _ = flip_evaluator.evaluate(*arrays, "HDR", parameters=exposures, **without)
     errors = {"R, G, B": np.asarray(of_rgb, dtype=np.float64)[..., 0], **_errors_of_others(reference, test)}
     seen = reference.seen_with(test)
     means = {name: float(values[seen].mean()) for name, values in errors.items()}
