@@ -68,7 +68,7 @@ def test_memory_is_not_that_of_numpy(variant_llvm_ad_rgb):  # noqa: ARG001
         np.testing.assert_array_equal(np.array(copy), np.arange(20))
 
 
-def test_what_is_uploaded_is_there_for_other_threads(variant_llvm_ad_rgb):  # noqa: ARG001
+def test_uploads_are_complete_for_other_threads(variant_llvm_ad_rgb):  # noqa: ARG001
     """Shapes that are loaded in parallel read tensors that they are given: a pending copy had other numbers."""
     values = np.arange(1 << 16, dtype=np.float32)
     with ThreadPoolExecutor(2) as pool:

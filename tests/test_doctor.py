@@ -9,7 +9,7 @@ from mitsuba_subdivision.doctor import in_words, try_variant
 from mitsuba_subdivision.llvm import ENVIRONMENT_VARIABLE
 
 
-def test_the_scalar_variant_works_and_all_is_told(monkeypatch, capsys):
+def test_the_report_lists_variants_and_packages(monkeypatch, capsys):
     monkeypatch.setattr(doctor, "VARIANTS", {"scalar_rgb": True, "cuda_ad_spectral_polarized_double": False})
     assert main(["doctor"]) == 0
     told = capsys.readouterr().out
@@ -36,7 +36,7 @@ def test_a_variant_that_fails_is_a_status_of_one(monkeypatch, capsys):
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")
-def test_a_missing_package_and_a_surface_at_the_wrong_place_are_told(monkeypatch):
+def test_a_missing_package_and_a_misplaced_surface_are_problems(monkeypatch):
     monkeypatch.setattr(doctor, "PACKAGES", ("numpy", "unheard-of-package"))
     report = doctor.diagnose({})
     assert not report["healthy"]
@@ -59,14 +59,14 @@ CRASHES = pytest.mark.skipif(not hasattr(os, "kill"), reason="processes have no 
         ("import time; time.sleep(60)", "did not end within 0.2 s"),
     ],
 )
-def test_how_a_process_ends_is_told(monkeypatch, child, problem):
+def test_the_report_says_how_a_process_ended(monkeypatch, child, problem):
     monkeypatch.setattr(doctor, "_CHILD", child)
     report = try_variant("scalar_rgb", seconds=0.2 if "sleep" in child else 60)
     assert (report["works"], report["problem"]) == (False, problem)
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems search for LLVM by their own rules")
-def test_a_library_that_is_none_is_told(monkeypatch, tmp_path):
+def test_a_broken_library_is_a_problem(monkeypatch, tmp_path):
     (tmp_path / "libLLVM.so.20").write_text("no library")
     monkeypatch.setenv(ENVIRONMENT_VARIABLE, str(tmp_path / "libLLVM.so.20"))
     report = try_variant("llvm_ad_rgb")

@@ -20,7 +20,7 @@ from reference.refined_cages import sheet
         (cube(), "doo_sabin"),
     ],
 )
-def test_predicted_triangles_are_those_of_the_tessellation(cage, scheme, rate):
+def test_predicted_triangles_equal_the_tessellation(cage, scheme, rate):
     surface = LimitSurface(cage, scheme)
     assert inspect(surface, rate)["triangle_count"] == len(surface.tessellate(rate).triangles)
 
@@ -82,12 +82,12 @@ TAKES_LONG = "classes of patches, semi-sharp up to 9.5: preparing them takes lon
         (torus(8, 8), None),
     ],
 )
-def test_what_will_look_odd_or_takes_long_is_told(cage, warning):
+def test_odd_and_slow_cages_warn(cage, warning):
     told = inspect(LimitSurface(cage))["warnings"]
     assert any(warning in line for line in told) if warning else told == []
 
 
-def test_rules_are_told_where_they_are_not_the_default():
+def test_only_rules_other_than_the_defaults_are_listed():
     assert inspect(LimitSurface(sheet(2, 2)))["rules"] == {}
     given = {"crease_method": "chaikin", "triangle_rule": "smooth"}
     inspected = inspect(LimitSurface(sheet(2, 2, **given, boundary="edge_only")))
@@ -95,7 +95,7 @@ def test_rules_are_told_where_they_are_not_the_default():
     assert "rules:          crease_method chaikin, triangle_rule smooth\n" in in_words(inspected)
 
 
-def test_the_command_prints_text_and_json_and_says_what_a_scheme_cannot_do(tmp_path, capsys):
+def test_the_command_prints_text_json_and_errors_of_schemes(tmp_path, capsys):
     """Names in JSON have no quotes of messages."""
     path = tmp_path / "cube.obj"
     cube().save(path)

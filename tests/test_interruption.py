@@ -65,7 +65,7 @@ def test_ctrl_c_does_not_wait_for_the_work(monkeypatch):
         presser.join()
 
 
-def test_work_that_ends_itself_by_an_interrupt_is_told(monkeypatch, capsys):
+def test_interrupts_within_the_work_are_reported(monkeypatch, capsys):
     def interrupt(*_):
         raise KeyboardInterrupt
 

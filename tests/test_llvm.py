@@ -195,7 +195,7 @@ RUNS_KERNELS = [
 
 
 @NEEDS_TOO_OLD
-def test_what_runs_kernels_is_an_error_where_they_would_abort():
+def test_calls_that_run_kernels_are_errors_with_old_libraries():
     """Earlier, the first evaluation of `on_device` ended the process."""
     done = run(
         f"""{LATE} import numpy as np

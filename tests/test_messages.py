@@ -87,7 +87,7 @@ def test_warnings_name_no_place_in_the_code(folder, capsys):
     ],
 )
 @pytest.mark.usefixtures("folder")
-def test_wrong_values_are_told(capsys, words, message):
+def test_wrong_values_are_errors(capsys, words, message):
     with pytest.raises(SystemExit) as stop:
         main(words.split())
     assert stop.value.code == 2
@@ -142,7 +142,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("words", "message"), REFUSED)
-def test_what_does_nothing_or_harm_is_refused_before_anything_is_written(folder, capsys, words, message):
+def test_useless_and_harmful_options_are_refused_before_writing(folder, capsys, words, message):
     (folder / "text.obj").write_text("v 1 2\n")
     before = sorted(folder.iterdir())
     assert main([*words.split(), *(["--variant", "scalar_rgb"] if words.startswith("render") else [])]) == 1
@@ -160,7 +160,7 @@ def test_a_variant_that_does_not_run_is_one_line(capsys, monkeypatch):
     assert capsys.readouterr().err == expected
 
 
-def test_no_render_begins_for_an_output_that_cannot_be(folder, capsys, monkeypatch):
+def test_renders_do_not_begin_for_invalid_outputs(folder, capsys, monkeypatch):
     (folder / "a.exr").mkdir()
     monkeypatch.setattr(mi, "render", lambda *_, **__: pytest.fail("rendered"))
     for output, message in (
@@ -213,7 +213,7 @@ def test_figures_have_the_options_that_the_command_line_knows():
         assert set(figure.formats) <= set(FigureOptions.formats)
 
 
-def test_a_command_does_not_wait_for_what_others_import():
+def test_commands_import_only_their_own_modules():
     """The program's own help neither, which lists all."""
     program = """import sys
 from mitsuba_subdivision.commands import COMMANDS, parser
@@ -289,7 +289,7 @@ def test_short_work_and_pipes_show_nothing(terminal, kind, patience):
     assert not stream.getvalue()
 
 
-def test_a_step_is_told_and_wiped(terminal):
+def test_progress_lines_are_wiped(terminal):
     stream = terminal(Terminal())
     with timed("Rendering") as at:
         at("part 2 of 3")

@@ -60,7 +60,7 @@ NO_VARIANT = r"expected the module mitsuba with a variant set, .* or its name, \
         ("opencl_rgb", 'variant "opencl_rgb"; expected one of'),
     ],
 )
-def test_anything_else_is_an_error_that_says_what_was_expected(monkeypatch, name, given, message):
+def test_other_arguments_are_errors_that_state_the_expected_ones(monkeypatch, name, given, message):
     if given is mi:
         monkeypatch.setattr(mi, "variant", lambda: None)
     with pytest.raises(ValueError, match=message):

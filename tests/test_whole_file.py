@@ -67,7 +67,7 @@ def names(folder):
         (lambda beside: RuntimeError(f'cannot write "{beside}"'), OSError, r"a\.txt"),
     ],
 )
-def test_a_failed_write_leaves_what_was_there_and_names_its_own_file(tmp_path, before, error, kind, message):
+def test_a_failed_write_keeps_the_old_file_and_names_it(tmp_path, before, error, kind, message):
     path = tmp_path / "a.txt"
     for name in before:
         (tmp_path / name).write_text("old")
@@ -125,7 +125,7 @@ def test_threads_write_one_file_without_mixing(tmp_path):
     assert names(tmp_path) == ["a.txt"]
 
 
-def test_what_a_living_process_writes_stays_and_one_that_ends_in_the_midst_takes_its_files_with_it(tmp_path):
+def test_only_unfinished_files_are_removed_at_exit(tmp_path):
     write(tmp_path / "a.txt", then=lambda: write(tmp_path / "b.txt"))
     with pytest.raises(FileNotFoundError):
         write(tmp_path / "c.txt", then=remove_unfinished)
@@ -164,7 +164,7 @@ def test_names_as_long_as_can_be(tmp_path, stem):
     assert names(tmp_path) == [path.name]
 
 
-def test_outputs_that_cannot_be_are_refused_by_their_own_name(tmp_path, monkeypatch):
+def test_invalid_outputs_are_refused_by_name(tmp_path, monkeypatch):
     (tmp_path / "folder.txt").mkdir()
     for name in ("file", "protected.txt"):
         (tmp_path / name).write_text("")
@@ -196,7 +196,7 @@ def test_inputs_are_refused_as_outputs(tmp_path):
 
 @pytest.mark.posix
 @pytest.mark.usefixtures("variant_scalar_rgb")
-def test_every_writer_tells_of_a_full_disk_and_leaves_what_was_there(tmp_path, np_rng):
+def test_every_writer_reports_a_full_disk_and_keeps_the_old_file(tmp_path, np_rng):
     resource = pytest.importorskip("resource")
     for package in ("pxr", "plyfile", "matplotlib"):
         pytest.importorskip(package)

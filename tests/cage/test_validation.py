@@ -175,7 +175,7 @@ def test_tags_are_read_only_and_what_is_equal_everywhere_takes_no_memory():
         ({"creases": [(0, 1, 3)], "corners": [(8, 1), (-1, 1)]}, r"corner at vertex 8, which .* \(2 such corners; n"),
     ],
 )
-def test_what_no_face_has_is_ignored_and_told(tags, message):
+def test_tags_without_a_face_are_ignored_with_a_warning(tags, message):
     with pytest.warns(CageWarning, match=message) as record:
         cage = tagged(cube(), **tags)
     assert len(record) == 1

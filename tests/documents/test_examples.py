@@ -260,7 +260,7 @@ def test_every_picture_of_a_page_is_there_and_every_option_in_its_text_is_one(pa
 
 
 @pytest.mark.parametrize(("mark", "parameters"), [("parameters", PARAMETERS), ("state parameters", STATE_PARAMETERS)])
-def test_the_tables_of_parameters_are_those_of_the_shape(mark, parameters):
+def test_parameter_tables_match_the_shape(mark, parameters):
     lines = ["| Parameter | Type | Description | Flags |", "|---|---|---|---|"]
     signs = {"exposed": "P", "readonly": "R", "differentiable": "∂", "discontinuous": "D"}
     for parameter in parameters:

@@ -92,7 +92,7 @@ def test_every_source_that_is_cited_is_in_the_bibliography():
     assert cited | on_pages == bibliography()
 
 
-def test_the_table_of_eigenvalues_is_what_the_rules_give():
+def test_the_table_of_eigenvalues_follows_the_rules():
     rows = rows_below(MATHEMATICS, "eigenvalues")
     assert {row[0] for row in rows} == {"catmull_clark", "loop", "doo_sabin"}
     for name, cell, *stated in rows:

@@ -158,24 +158,6 @@ def test_limit_stencils_match_the_published_numbers(scheme, valence):
 
 
 @EVERY_SCHEME
-@pytest.mark.parametrize("valence", [3, 4, 5, 12, 50])
-def test_limit_stencil_agrees_with_evaluation_and_is_affine(scheme, valence):
-    stencil = limit_stencil(scheme, valence)
-    assert stencil.position.sum() == pytest.approx(1, abs=STENCIL)
-    assert np.abs(stencil.tangents.sum(axis=1)).max() <= STENCIL * valence
-    cage = bumpy_ball(scheme, valence)
-    faces = faces_of(cage)
-    slots = faces[0]
-    if scheme != "doo_sabin":
-        ring = np.array(faces[:valence])
-        slots = [0, *ring[:, 1], *(ring[:, 2] if scheme == "catmull_clark" else [])]
-    points = cage.positions[slots]
-    sample = LimitSurface(cage, scheme).evaluate(0, [[0.0, 0.0]])
-    assert np.abs(stencil.position @ points - sample.p[0]).max() <= POINT
-    assert angle(np.cross(*(stencil.tangents @ points)), sample.n[0]) <= NORMAL
-
-
-@EVERY_SCHEME
 def test_limit_stencil_of_valence_2_is_an_error(scheme):
     with pytest.raises(SchemeError, match="valence 2: expected 3 or more"):
         limit_stencil(scheme, 2)

@@ -1,5 +1,3 @@
-"""Texture coordinates and attributes at any place: laws, and refinement by an independent reference."""
-
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage, LimitSurface, SchemeError
@@ -236,7 +234,7 @@ def test_a_constant_stays_one(np_rng):
 # Doo-Sabin
 
 
-def test_doo_sabin_interpolates_what_has_no_seams(np_rng):
+def test_doo_sabin_interpolates_attributes_without_seams(np_rng):
     cage = torus(5, 4)
     texcoords, attributes = face_varying(cage.positions[:, :2], cage.face_vertices), {"vertex": cage.positions}
     surface = LimitSurface(tagged(cage, texcoords=texcoords, attributes=attributes), "doo_sabin")
@@ -255,7 +253,7 @@ def test_doo_sabin_interpolates_what_has_no_seams(np_rng):
         (face_varying(np.zeros((8, 1)), cube().face_vertices), "all", "no rules for linear interpolation"),
     ],
 )
-def test_doo_sabin_has_no_rules_for_others(attribute, mode, message):
+def test_doo_sabin_refuses_seams_and_linear_attributes(attribute, mode, message):
     surface = LimitSurface(tagged(cube(), attributes={"a": attribute}, face_varying=mode), "doo_sabin")
     with pytest.raises(SchemeError, match=message):
         surface.evaluate_attribute("a", 0, [[0, 0]])

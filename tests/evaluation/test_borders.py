@@ -1,5 +1,3 @@
-"""Open cages, creases, darts and corners: exact on every class of patch."""
-
 import re
 from dataclasses import replace
 

@@ -111,7 +111,7 @@ def test_the_basis_of_a_defective_matrix_keeps_a_block_whose_powers_are_exact(ca
 
 @pytest.mark.core
 @EVERY_HIDDEN
-def test_hidden_blocks_are_those_of_the_basis(sizes, hidden):
+def test_basis_finds_hidden_blocks(sizes, hidden):
     matrix = similar(hidden)
     basis = eigenbasis(matrix)
     assert [len(block) for _, block in basis.blocks] == sizes

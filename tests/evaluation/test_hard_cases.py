@@ -1,5 +1,3 @@
-"""Samples far down, where powers of Jordan blocks grow, and around vertices of valence 2."""
-
 from itertools import pairwise
 
 import numpy as np
@@ -38,7 +36,7 @@ def test_valence_2_matches_explicit_refinement_and_its_normal_is_that_of_the_sub
         assert angle(normals, np.cross(a - c, b - d)).max() <= NORMAL
 
 
-def test_loop_at_valence_2_is_what_refinement_comes_to():
+def test_loop_at_valence_2_is_the_limit_of_refinement():
     """Faces of a refined pillow meet in two edges between the same vertices, which are different edges."""
     surface = LimitSurface(PILLOW, "loop")
     topology, points = PILLOW.topology, PILLOW.positions

@@ -1,5 +1,3 @@
-"""Elements are divided where they have to be, alike parts once, and what is wrong with a scheme is told."""
-
 import numpy as np
 import pytest
 from evaluation.common import ChangedCatmullClark, classes, patch_of

@@ -16,7 +16,7 @@ def assert_equal_derivatives(derivatives, expected, rounding=1):
 
 
 @pytest.mark.parametrize("name", SURFACES)
-def test_affine_maps_of_the_cage_are_those_of_the_surface(name, np_rng):
+def test_surfaces_commute_with_affine_maps(name, np_rng):
     surface, scale = surface_named(name), 10 ** np_rng.uniform(-3, 3)
     matrix, shift = scale * np_rng.standard_normal((3, 3)), np_rng.standard_normal(3)
     samples = random_locations(surface, np_rng, SAMPLES, deepest=10)

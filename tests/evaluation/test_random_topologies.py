@@ -4,7 +4,7 @@ from fuzz import topologies
 FEW = 60
 
 
-def test_surfaces_of_random_topologies_agree_with_those_of_their_refined_cages():
+def test_random_surfaces_equal_the_surfaces_of_their_refined_cages():
     outcomes = [topologies.outcome(seed) for seed in range(FEW)]
     wrong = [(seed, result) for seed, (result, _) in enumerate(outcomes) if not result.startswith(("ok", "refused"))]
     assert wrong == []

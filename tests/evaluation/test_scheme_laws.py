@@ -199,7 +199,7 @@ class OtherBorder(CatmullClark):
     ],
     ids=lambda value: getattr(value, "name", ""),
 )
-def test_rules_that_break_a_law_are_told(scheme, message):
+def test_broken_laws_are_errors(scheme, message):
     with pytest.raises(SchemeError, match=message):
         check_scheme(scheme)
 
@@ -232,7 +232,7 @@ def test_without_phantom_points_seams_of_texture_coordinates_are_refused(np_rng)
 
 
 @pytest.mark.parametrize("scheme", [CatmullClark, object(), 3])
-def test_what_is_no_scheme_is_refused(scheme):
+def test_other_objects_than_schemes_are_refused(scheme):
     for use in (register_scheme, lambda s: LimitSurface(cube(), s)):
         with pytest.raises(SchemeError, match="expected a scheme's name, or an object of a class derived from Scheme"):
             use(scheme)

@@ -66,7 +66,7 @@ NO_POINTS = ([1.0, 2.0, 3.0], [[1.0, 2.0]], [[0.0, np.nan, 0.0]], [[np.inf, 0.0,
         (lambda _: limit_stencil("loop", "5"), "limit stencil of valence '5': expected an integer"),
     ],
 )
-def test_wrong_arguments_are_errors_that_say_what_and_where(call, message):
+def test_wrong_arguments_raise_errors_with_value_and_place(call, message):
     with pytest.raises(ValueError, match=message):
         call(LimitSurface(cube()))
 

@@ -132,7 +132,7 @@ def with_all_data(cage, suffix, number, rng):
 
 @pytest.mark.core
 @pytest.mark.parametrize("suffix", [".OBJ", ".ply", *USD])
-def test_what_is_saved_is_read_back(any_cage, suffix, request, tmp_path, np_rng):
+def test_saved_cages_are_read_back(any_cage, suffix, request, tmp_path, np_rng):
     """Bit by bit, with every rule that tags of OBJ and tokens of USD stand for; what was there is replaced."""
     skip_without_package(suffix)
     number = request.node.callspec.indices["any_cage"]
@@ -176,7 +176,7 @@ NO_PLACE = {
 
 
 @pytest.mark.parametrize("suffix", NO_PLACE)
-def test_a_warning_names_what_has_no_place(suffix, tmp_path):
+def test_a_warning_names_data_without_a_place_in_the_format(suffix, tmp_path):
     skip_without_package(suffix)
     given, lost, kept = NO_PLACE[suffix]
     cage = ControlCage(tetrahedron().positions, tetrahedron().face_vertices.reshape(-1, 3), **given)

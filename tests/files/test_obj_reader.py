@@ -171,7 +171,7 @@ MALFORMED = [
 
 
 @pytest.mark.parametrize(("text", "message"), MALFORMED)
-def test_malformed_files_and_those_that_end_too_early(text, message, obj_file):
+def test_malformed_and_truncated_files_are_errors(text, message, obj_file):
     path = obj_file(text)
     with pytest.raises(CageError, match=".*".join(re.escape(part) for part in [f'"{path}"', *message])) as caught:
         ControlCage.from_file(path)
@@ -259,7 +259,7 @@ RULES = {
 
 
 @pytest.mark.parametrize(("rule", "tag"), RULES)
-def test_rules_are_those_of_tags_unless_an_argument_overrides_them(read, rule, tag):
+def test_arguments_override_the_rules_of_tags(read, rule, tag):
     override = contents.RULES[rule][-1]
     for value, expected in RULES[rule, tag].items():
         assert getattr(read(f"t {tag.format(value)}\n"), rule) == expected
@@ -287,7 +287,7 @@ WITHOUT_EFFECT = {
 
 
 @pytest.mark.parametrize(("tag", "message"), WITHOUT_EFFECT.items())
-def test_a_warning_names_what_has_no_effect_in_few_words(read, tag, message):
+def test_a_short_warning_names_tags_without_effect(read, tag, message):
     shown = tag if len(tag) < 100 else r"vertexedit 100/0/0 0 0 [ 0]*\.\.\."
     with pytest.warns(CageWarning, match=rf'cage.obj", line 9: tag "{shown}" {message}'):
         read(f"t {tag}\n")
@@ -333,7 +333,7 @@ def test_wrong_tags_are_errors_that_name_their_line_in_few_words(read, tag, mess
         ("corner 2/1/0 6 1 10", "corner at vertex 7, which is none of 6 vertices, is ignored", [], [1]),
     ],
 )
-def test_tags_of_what_no_face_has_are_ignored_and_told(read, tag, message, edges, corners):
+def test_tags_without_a_face_are_ignored_with_a_warning(read, tag, message, edges, corners):
     """As OpenSubdiv's Far::TopologyRefinerFactory does; the others of the statement count."""
     with pytest.warns(CageWarning, match=f'cage.obj", line 9: {message}'):
         cage = read(f"t {tag}\n")

@@ -47,7 +47,6 @@ def element(name, count, *properties):
 
 
 def with_data(properties, rows):
-    """The sheet with further properties of vertices."""
     lines = SHEET.splitlines()
     start = lines.index("end_header") + 1
     changed = [*lines[:7], *(f"property {name}" for name in properties), *lines[7:start]]
@@ -176,7 +175,7 @@ def test_columns_are_attributes_by_their_names(read, np_rng, kind, properties, e
         np.testing.assert_array_equal(data[name].values, values)
 
 
-def test_a_warning_names_what_is_left_out(read):
+def test_a_warning_names_ignored_properties(read):
     more = "vertex_indices\nproperty uchar flags\nproperty list uchar float texcoord\n"
     text = SHEET.replace("vertex_indices\n", more).replace("4 0 1 2 3", "4 0 1 2 3 1 0")
     message = 'cage.ply": "flags" of faces, "texcoord" of faces left out; expected numbers at'

@@ -126,7 +126,7 @@ def test_equal_texture_coordinates_without_indices_are_shared(read, end, shared)
     assert (index[1], index[2], len(set(index))) == (index[4], index[7], 6)
 
 
-def test_texture_coordinates_are_those_of_the_first_known_name(read):
+def test_texture_coordinates_have_the_first_known_name(read):
     other, uv_map, st = (UV.format(name) for name in ("zzz", "UVMap", "st"))
     assert list(read(other + uv_map + st).attributes) == ["UVMap", "zzz"]
     assert list(read(other + uv_map).attributes) == ["zzz"]
@@ -139,7 +139,7 @@ def test_texture_coordinates_are_those_of_the_first_known_name(read):
     assert (list(cage.attributes), cage.texcoords) == (["zzz"], None)
 
 
-def test_primvars_become_attributes_and_a_warning_names_those_of_other_kinds(read):
+def test_primvars_become_attributes_and_unsupported_ones_warn(read):
     lines = """color3f[] primvars:displayColor = [(1, 0, 0), (0, 1, 0)] (interpolation = "vertex")
         int[] primvars:displayColor:indices = [0, 1, 0, 1, 1, 0]
         double[] primvars:weight = [0, 1, 2, 3, 4, 5] (interpolation = "varying")
@@ -368,7 +368,7 @@ def test_names_that_are_not_utf_8_are_errors_that_name_the_file(read, tmp_path, 
 
 
 @pytest.mark.parametrize("suffix", [".usd", ".usda", ".usdc", ".usdz"])
-def test_malformed_files_and_those_without_meshes_name_the_file(tmp_path, suffix):
+def test_errors_of_malformed_and_empty_files_name_the_file(tmp_path, suffix):
     path = tmp_path / f"bad{suffix}"
     for content in (b"", b"#usda 1.0\ndef Mesh {", b"PXR-USDC" + bytes(20)):
         path.write_bytes(content)
@@ -510,7 +510,7 @@ UNSEEN, FLAT = "they are invisible, guides or proxies", "their subdivisionScheme
         ("uniform token subdivisionScheme = 'none'", FLAT),
     ],
 )
-def test_what_is_not_to_be_seen_or_smoothed_is_left_out_with_a_warning_unless_it_is_asked_for(read_all, token, reason):
+def test_invisible_and_unsmoothed_meshes_are_left_out_with_a_warning_by_default(read_all, token, reason):
     house = HOUSE.replace("<more>", token)
     with pytest.warns(CageWarning, match=f"meshes /house left out, as {reason}; expected"):
         assert read_all(STRIP, house).source.name.endswith("/sheet")
@@ -551,7 +551,7 @@ IGNORED_TAGS = [
 
 
 @pytest.mark.parametrize(("old", "new", "message"), IGNORED_TAGS)
-def test_tags_of_what_their_own_mesh_lacks_are_ignored_and_told(read_all, old, new, message):
+def test_tags_without_an_edge_or_vertex_are_ignored_with_a_warning(read_all, old, new, message):
     """A number that is a vertex of another mesh, too."""
     whole = read_all(STRIP, HOUSE).tags
     with pytest.warns(CageWarning, match=f"prim /sheet: {message}"):

@@ -60,7 +60,7 @@ def test_a_box_is_found_from_a_cube(views):
 
 
 @pytest.mark.parametrize(("refinements", "least", "most"), [(0, 0.9, 1.0), (2, 0.0, 0.5)])
-def test_smoothing_slows_what_neighbours_do_against_each_other_in_dense_cages_alone(views, refinements, least, most):
+def test_smoothing_damps_opposed_motions_of_neighbours_in_dense_cages_only(views, refinements, least, most):
     """Here, to give up random displacements, for a regularizer beside which pictures do not count."""
     cage = cube()
     for _ in range(refinements):
@@ -74,7 +74,7 @@ def test_smoothing_slows_what_neighbours_do_against_each_other_in_dense_cages_al
     assert least < fallen[1.0] / fallen[0.0] < most
 
 
-def test_steps_that_collapse_the_surface_or_have_no_finite_loss_are_told(views):
+def test_collapsing_steps_and_infinite_losses_are_errors(views):
     """The first step of Adam moves each coordinate by the learning rate: here, to the centre."""
     diagonal = np.sqrt(12)
     fit = made(cube(), views, smoothing=0, learning_rate=1 / diagonal, regularizers={"laplacian": 1e6})
@@ -238,7 +238,7 @@ PICTURE = np.zeros((SIZE, SIZE, 3))
         ({"learning_rate": "high"}, "learning_rate is 'high'; expected a number"),
     ],
 )
-def test_what_cannot_be_fitted_is_told(changes, message):
+def test_invalid_fits_are_errors(changes, message):
     changes = {"views": [PICTURE], "masks": [None], "scene": SKY, **changes}
     given = zip(changes.pop("views"), changes.pop("masks"), strict=False)
     views = [View(sensor(PLACES[0]), picture, mask) for picture, mask in given]

@@ -183,6 +183,6 @@ def test_a_schedule_has_these_numbers(given, numbers):
         ([(5, 1.0), (5, 2.0)], r"rate has the steps \[5.0, 5.0\]; expected increasing ones"),
     ],
 )
-def test_what_is_no_schedule_is_refused(given, message):
+def test_invalid_schedules_are_refused(given, message):
     with pytest.raises(ValueError, match=message):
         Schedule.of(given, "rate")

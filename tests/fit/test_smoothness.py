@@ -93,7 +93,6 @@ def test_a_step_is_that_of_mitsuba(surface, np_rng):
 
 @pytest.mark.core
 def test_coordinates_and_points_are_inverse_and_derivatives_solve_the_same_system(surface, np_rng):
-    """In reverse and in forward mode, as the matrix is symmetric."""
     points, steps = surface.cage.positions, LargeSteps(surface.cage.laplacian(), 3.0)
     again = steps.from_differential(steps.to_differential(points))
     np.testing.assert_allclose(np.array(again).reshape(-1, 3), points, atol=SINGLE)

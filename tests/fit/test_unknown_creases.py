@@ -32,7 +32,7 @@ def creases(name, method="uniform", count=6):
 @pytest.mark.core
 @EVERY_CAGE
 @pytest.mark.parametrize("method", ["uniform", "chaikin"])
-def test_points_are_those_of_the_tagged_cage_refined(name, method, np_rng):
+def test_points_equal_the_refined_tagged_cage(name, method, np_rng):
     unknown, scheme = creases(name, method)
     for sharpness in (np_rng.uniform(0, HIGHEST, len(unknown.initial)), np.arange(len(unknown.initial)) % 4):
         cage = unknown.with_sharpness(sharpness)
@@ -72,7 +72,7 @@ def test_derivatives_are_differences(name, method, np_rng):
 
 
 @pytest.mark.parametrize("name", ["cube", "triangles"])
-def test_what_is_left_after_a_refinement_makes_the_same_points(name):
+def test_remaining_sharpness_gives_the_same_points(name):
     unknown, scheme = creases(name)
     sharpness = np.linspace(1, HIGHEST, len(unknown.initial))
     cage = unknown.with_sharpness(sharpness)
@@ -82,7 +82,7 @@ def test_what_is_left_after_a_refinement_makes_the_same_points(name):
     np.testing.assert_allclose(left.matrix(sharpness - 1) @ cage.refined(scheme).positions, expected, atol=ROUNDING)
 
 
-def test_what_cannot_be_unknown_is_named():
+def test_invalid_unknown_creases_are_errors():
     cube, one = named_cages.cube(), np.zeros(1, dtype=np.int64)
     with pytest.raises(CageError, match="is no edge of a face"):
         UnknownCreases(cube, [(0, 7)], one, HIGHEST, None)

@@ -81,7 +81,6 @@ def _open_files() -> Counter[str]:
 
 
 def read_one(folder: str, reader: str, seed: int, index: int) -> str | None:
-    """Read a file; what law it breaks."""
     suffix, content = damaged_file(reader, seed, index)
     path, start = Path(folder) / f"{index}{suffix}", time.process_time()
     path.write_bytes(content)

@@ -78,5 +78,4 @@ class Pictures:
 
 
 def sum_along(gradients, along):
-    """Estimate of the derivative along directions, by key."""
     return Estimate(sum(gradients[key] @ np.ravel(along[key]).astype(np.float64) for key in along))

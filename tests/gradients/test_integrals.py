@@ -34,7 +34,7 @@ def affine_change(linear, shift, integrals):
 
 @pytest.mark.skipif(llvm_problem() is not None, reason="no usable LLVM")
 @pytest.mark.parametrize("name", CLOSED)
-def test_triangles_and_the_surface_change_by_affine_motions_as_they_must_and_converge(name):
+def test_affine_motions_have_closed_forms_and_triangles_converge(name):
     surface, types = CLOSED[name](), ArrayTypes(sys.modules["drjit.llvm.ad"].Float64)
     affine = [surface.cage.positions @ linear.T + shift for linear, shift in AFFINE.values()]
     others = [motions(surface)[name] for name in ("one point", "all")]

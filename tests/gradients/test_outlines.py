@@ -31,7 +31,7 @@ def moving(scene, positions, samples=SAMPLES, seeds=6):
 
 
 @pytest.mark.parametrize("name", [name for name in SURFACES if name != "semi-sharp"])
-def test_gradients_of_outlines_are_those_of_the_area_covered(name):
+def test_outline_gradients_are_changes_of_the_covered_area(name):
     surface = SURFACES[name]()
     gradients = moving(outline_of(surface), surface.cage.positions).gradients()
     # No outline changes by more than its own size.

@@ -135,7 +135,6 @@ def test_rays_from_far_away_hit_as_exactly_as_from_nearby():
 @pytest.mark.core
 @pytest.mark.parametrize("rounds", [1, 2, 3])
 def test_locations_are_where_the_points_lie_however_few_rounds_there_are(monkeypatch, np_rng, rounds):
-    """Also where a search ends in the last round that it has."""
     surface, kernel = surface_named("mixed torus"), kernel_named("mixed torus", DOUBLE)
     types = kernel.types
     monkeypatch.setattr(line_intersection, "ROUNDS", rounds)

@@ -28,7 +28,7 @@ def test_weighted_values_and_derivatives_are_products(float_type, rounding, weig
     np.testing.assert_allclose(derivative, (weights @ change).ravel(), rtol=0, atol=rounding)
 
 
-def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, rounding, weights, np_rng):
+def test_looked_up_values_follow_in_place(float_type, rounding, weights, np_rng):
     types = ArrayTypes(float_type)
     first, second = np_rng.random((2, COLUMNS, 3))
     values = ControlValues(types, 3, SparseMatrix(weights, types.float)).load(first)
@@ -46,7 +46,7 @@ def test_what_is_looked_up_follows_and_stays_the_same_object(float_type, roundin
     np.testing.assert_allclose(gradient, weights.toarray()[5][:, None] * [1, 0, 0], rtol=0, atol=rounding)
 
 
-def test_equal_values_share_what_is_made_of_them_until_they_are_set(float_type, rounding, weights, np_rng):
+def test_equal_values_share_arrays_until_they_are_set(float_type, rounding, weights, np_rng):
     types, matrix = ArrayTypes(float_type), SparseMatrix(weights, float_type)
     values = np_rng.random((COLUMNS, 3))
     first, second = (ControlValues(types, 3, matrix).load(values.copy()) for _ in range(2))

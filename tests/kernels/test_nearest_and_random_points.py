@@ -72,7 +72,6 @@ def test_locations_of_results_start_the_next_call(np_rng):
 
 @pytest.mark.parametrize("name", ["sheet", "half disc of 6", "loop sheet", "holes", "crease"])
 def test_minima_on_borders_are_found(name, np_rng):
-    """From inside an element, for points that lie beyond a border."""
     surface = surface_named(name)
     size, points = points_near(surface, 150, np_rng, 0.3)
     points += np_rng.normal(size=points.shape) * 0.3 * size

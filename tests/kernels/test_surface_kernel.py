@@ -101,7 +101,6 @@ BORDERS = ["sheet without corners", "half disc of 6", "dart", "crease", "corner"
 @pytest.mark.core
 @pytest.mark.parametrize("name", BORDERS)
 def test_normals_at_borders_are_exact_in_single_precision_down_to_the_vertex(name, np_rng):
-    """Where the derivatives become parallel, level by level."""
     surface = surface_named(name)
     elements, cut = surface.patches.elements, surface.patches.topology
     element, uv, corner = random_locations(surface, np_rng, 4000, deepest=22)
@@ -113,7 +112,7 @@ def test_normals_at_borders_are_exact_in_single_precision_down_to_the_vertex(nam
 
 
 @pytest.mark.parametrize("name", ["hexagon", "valence 2", "half disc of 6", "corner", "loop half disc of 6"])
-def test_normals_are_those_of_corners_only_where_points_are(name, np_rng):
+def test_corner_normals_hold_only_at_the_corner(name, np_rng):
     """Next to a corner whose normal is a convention, or a slow limit, exact normals differ from it at every level.
 
     Kernels have the corner's own normal where the point is the corner in single precision, and only there.
@@ -306,9 +305,6 @@ def test_surfaces_have_the_precision_of_their_variant_and_unknown_ones_are_error
         assert surface.on_device(SINGLE).types.float is dr.llvm.ad.Float
         assert surface.on_device(DOUBLE).types.float is dr.llvm.ad.Float64
         assert surface.on_device("llvm_rgb").types.float is dr.llvm.Float
-    for arguments, message in (
-        (["opencl_rgb"], f'variant "opencl_rgb"; {ARRAYS_ONLY}'),
-        (["scalar_rgb"], f'variant "scalar_rgb"; {ARRAYS_ONLY}'),
-    ):
-        with pytest.raises(ValueError, match=message):
-            surface.on_device(*arguments)
+    for name in ("opencl_rgb", "scalar_rgb"):
+        with pytest.raises(ValueError, match=f'variant "{name}"; {ARRAYS_ONLY}'):
+            surface.on_device(name)

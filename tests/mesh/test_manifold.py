@@ -12,7 +12,7 @@ from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.mesh import manifold
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from patches.closed_cages import polygons, tetrahedron, torus
-from peers.fidelity_cages import book, fan, joined, strip
+from peers.fidelity_cages import MODES, book, fan, joined, strip
 from reference.exact_samples import faces_of, mesh_of
 from reference.non_manifold import NonManifoldParts
 from reference.refined_cages import changed, sheet, tagged
@@ -167,7 +167,7 @@ def test_the_first_ones_are_named():
     assert record[0].filename == __file__
 
 
-def test_three_of_a_kind_are_named_and_an_edge_of_one_face_is_none_of_many():
+def test_messages_name_three_of_a_kind_and_edges_of_one_face_apart():
     spines = [[2 * k, 2 * k + 1, 8 + 3 * k + page] for k in range(4) for page in range(3)]
     for count, more in ((3, ""), (4, ", ...")):
         with pytest.warns(CageWarning) as record:
@@ -200,13 +200,7 @@ def test_each_fan_at_a_shared_vertex_has_its_own_surface_under_doo_sabin():
     assert surface.patches.patch_count == 1 + 5
 
 
-@pytest.mark.parametrize(
-    ("triangles", "mode"),
-    [
-        *((False, mode) for mode in ("none", "corners_only", "corners_plus1", "corners_plus2", "boundaries")),
-        *((True, mode) for mode in ("corners_plus1", "boundaries")),
-    ],
-)
+@pytest.mark.parametrize(("triangles", "mode"), [*((False, m) for m in MODES[:5]), *((True, m) for m in MODES[2:5:2])])
 def test_values_of_pages_are_held_where_they_differ_along_the_spine(triangles, mode, np_rng):
     """Each page's values are the surface of the page alone, with corners at both ends of every edge that is torn."""
     pages, spine, scheme = 3, 4, "loop" if triangles else "catmull_clark"
@@ -265,7 +259,7 @@ def random_faces(rng):
 RANDOM_MESHES = 300
 
 
-def test_what_is_no_manifold_is_so_by_definition(np_rng):
+def test_non_manifold_parts_follow_the_definition(np_rng):
     creases = closed_fans = manifolds = 0
     for _ in range(RANDOM_MESHES):
         faces = random_faces(np_rng)

@@ -28,18 +28,15 @@ def turned(count, size, seed):
 @pytest.mark.parametrize("order", [1, -1], ids=["forward", "reversed"])
 def test_triangles_of_a_polygon_cover_its_area_once_with_its_orientation(polygon, order):
     flat = np.column_stack([polygon, np.zeros(len(polygon))])[::order]
+    one = np.array([len(flat)]), np.arange(len(flat))
     for rotation, start in turned(12, len(flat), 0):
-        corners, face = triangle_corners(np.roll(flat, start, axis=0) @ rotation.T + 3, *one(len(flat)))
+        corners, face = triangle_corners(np.roll(flat, start, axis=0) @ rotation.T + 3, *one)
         a, b, c = (np.roll(flat, start, axis=0)[corner] for corner in corners.T)
         areas = np.cross(b - a, c - a)[:, 2] / 2
         area = signed_area(flat[:, :2])
         # Unsigned areas add up to the polygon's only if no triangle overlaps another, or lies outside.
         np.testing.assert_allclose([areas.sum(), np.abs(areas).sum()], [area, abs(area)], rtol=ROUNDING)
         assert not face.any()
-
-
-def one(size):
-    return np.array([size]), np.arange(size)
 
 
 def test_convex_and_degenerate_polygons_are_fans_and_faces_keep_their_order():

@@ -87,7 +87,7 @@ def test_seeds_determine_points():
     assert (surface.sample(100, rng).p != first.p).any(axis=1).all()
 
 
-def test_points_are_those_of_their_parameters():
+def test_points_equal_the_surface_at_their_parameters():
     surface = surface_named("rook")
     samples = surface.sample(1000)
     expected = surface.evaluate(samples.element, samples.uv, samples.corner)

@@ -190,7 +190,7 @@ def test_far_points_are_compared_with_few_pieces(name, np_rng, monkeypatch):
 
 @pytest.mark.core
 @pytest.mark.parametrize("most", [closest_points.MOST_PAIRS, 10])
-def test_near_boxes_are_those_no_further_than_asked(most, np_rng, monkeypatch):
+def test_near_boxes_lie_within_the_distance(most, np_rng, monkeypatch):
     """In whole numbers, so that some are exactly as far."""
     monkeypatch.setattr(closest_points, "MOST_PAIRS", most)
     lower = np_rng.integers(0, 20, (300, 3)).astype(float)

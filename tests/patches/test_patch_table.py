@@ -36,7 +36,7 @@ def assert_classes_differ(table):
 
 
 @pytest.mark.parametrize(("scheme", "cage"), EVERY_CAGE.values(), ids=EVERY_CAGE)
-def test_patches_of_a_class_have_its_signature_and_one_ring_and_others_have_not(scheme, cage):
+def test_classes_group_patches_by_signature_and_one_ring(scheme, cage):
     table = patch_table(scheme, cage)
     for patch_class in table.classes:
         assert len(set(table.is_whole[table.elements.face[patch_class.corners]])) == 1

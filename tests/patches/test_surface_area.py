@@ -38,7 +38,7 @@ def test_area_of_a_box_of_creases():
 @pytest.mark.parametrize(
     "name", ["hexagon", "into a dart", "half disc of 6", "chaikin", "loop corner", "doo_sabin sheet"]
 )
-def test_areas_are_limits_of_those_of_triangles(name):
+def test_areas_are_limits_of_triangle_areas(name):
     surface = surface_named(name)
     coarse, middle, fine = (triangle_area(surface, rate) for rate in SEGMENTS)
     first, second = (4 * middle - coarse) / 3, (4 * fine - middle) / 3

@@ -255,7 +255,6 @@ def _moved(around, vertex, index, scheme):
 
 
 def _along(around, vertex, index, value, sharp):
-    """The rule of a crease, along its two edges."""
     # The first edge of a face at the vertex ends in the next corner, the last in the one before.
     ends = []
     for f, i in around.at_vertex[vertex]:

@@ -136,7 +136,7 @@ def passes(tmp_path_factory):
     return path
 
 
-def test_passes_and_merge_give_what_one_command_gives(passes, tmp_path):
+def test_merged_passes_equal_one_render(passes, tmp_path):
     assert merge(tmp_path / "merged.exr", *(passes / f"{i}.exr" for i in (3, 1, 2))) == 0
     assert (tmp_path / "merged.exr").read_bytes() == (passes / "whole.exr").read_bytes()
 
@@ -162,7 +162,7 @@ def test_passes_of_other_images_are_status_3(passes, capsys, words, message):
     assert not (passes / "merged.exr").exists()
 
 
-def test_a_missing_pass_is_told(passes, capsys, tmp_path):
+def test_a_missing_pass_warns(passes, capsys, tmp_path):
     for there, missing in (("13", "2"), ("2", "1, 3")):
         assert merge(tmp_path / "merged.exr", *(passes / f"{number}.exr" for number in there)) == 0
         told = capsys.readouterr().err

@@ -72,7 +72,7 @@ def test_the_relative_error_of_noise_is_the_one_expected(first, second, np_rng):
     assert abs(measured / expected - 1) < NOISE
 
 
-def test_the_worst_pixel_is_none_that_only_one_image_hits_and_names_values_and_surface(reference, judged):
+def test_the_worst_pixel_is_hit_in_both_images_and_names_values_and_surface(reference, judged):
     """A pixel of the outline is missing, and a normal in the middle is turned."""
     y, x = np.argwhere(dome().hit)[0]
     normal = dome().normal.copy()
@@ -161,7 +161,7 @@ def test_each_scale_sees_changes_of_its_size(judged, side, factor):
     assert result.worst[0] >= 4
 
 
-def test_exposures_are_those_that_flip_chooses_and_do_not_depend_on_what_is_below_black():
+def test_exposures_equal_flips_choice_and_ignore_negative_values():
     flip_evaluator = pytest.importorskip("flip_evaluator")
     pixels = (truth() * np.geomspace(0.01, 90, SIZE)[:, None, None]).astype(np.float32)[1:, 1:]
     chosen = flip_evaluator.evaluate(pixels, pixels, "HDR")[2]
@@ -173,7 +173,7 @@ def test_exposures_are_those_that_flip_chooses_and_do_not_depend_on_what_is_belo
 
 
 @pytest.mark.parametrize("degrees", [1e-6, 30, 179])
-def test_angles_between_normals_are_those_of_a_turn(degrees):
+def test_angles_between_normals_are_exact(degrees):
     turned = np.array([math.cos(math.radians(degrees)), math.sin(math.radians(degrees)), 0])
     assert math.isclose(normal_angle(np.array([1.0, 0, 0]), turned), degrees, rel_tol=1e-9)
 
@@ -203,7 +203,7 @@ def test_one_batch_has_no_variance_and_a_reference_needs_16_times_the_samples(ju
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("role", ["test", "reference"])
-def test_what_is_not_finite_fails_first_and_by_name(reference, np_rng, value, role):
+def test_non_finite_pixels_fail_first_and_by_name(reference, np_rng, value, role):
     pixels = reference.pixels.copy()
     pixels[3:5, 5, 1] = pixels[4, 6, 0] = value
     broken = replace(reference, pixels=pixels)
@@ -262,7 +262,6 @@ def test_normals_at_silhouettes_do_not_count_and_from_the_third_pixel_on_they_do
 
 @pytest.mark.parametrize(("other", "what"), [("angle_p999", "maximum"), ("angle_max", "99.9th percentile")])
 def test_the_worst_normal_is_none_at_a_silhouette(judged, other, what):
-    """Its own is turned more than those of some pixels in the middle."""
     normal = probe_with(normal=rotated(20))["probe"].normal
     normal[tuple(np.argwhere(dome().hit)[0])] *= -1
     result = judged(["probe"], LIMITS.with_values({other: 180}), **probe_with(normal=normal))
@@ -270,7 +269,7 @@ def test_the_worst_normal_is_none_at_a_silhouette(judged, other, what):
     assert is_within(result.worst, 12, 20)
 
 
-def test_the_worst_pixel_is_of_what_fails_before_what_is_a_warning(reference, judged):
+def test_the_worst_pixel_belongs_to_a_failure_before_a_warning(reference, judged):
     """Another environment makes pixels of the same samples a warning; and a square is brighter."""
     paired = reference.paired.copy()
     paired[7, 9] *= 1.001
@@ -379,7 +378,7 @@ def test_each_image_has_its_own_noise(of_reference, of_test):
     assert alarms <= 1
 
 
-def test_alpha_is_compared_and_told_where_only_one_image_has_it():
+def test_alpha_is_compared_and_warned_of_in_one_image_only():
     plain = Image("plain", truth())
     made = [np.dstack([plain.pixels, np.full((SIZE, SIZE), value)]) for value in (1, 0)]
     opaque, clear = (replace(plain, pixels=pixels, names=("R", "G", "B", "A")) for pixels in made)
@@ -438,12 +437,12 @@ UNUSABLE = {
 
 
 @pytest.mark.parametrize(("message", "run"), UNUSABLE.items(), ids=UNUSABLE)
-def test_what_cannot_be_compared_is_said(reference, message, run):
+def test_incomparable_images_are_errors(reference, message, run):
     with pytest.raises(RegressionError, match=message):
         run(reference)
 
 
-def test_flip_tells_changes_of_plain_images_apart_and_refuses_what_it_does_not_see():
+def test_flip_sees_changes_of_plain_images_and_refuses_non_finite_ones():
     def flip(test, limits=LIMITS):
         return compare_flip(Image("reference", truth()), Image("test", test), limits)
 

@@ -14,7 +14,7 @@ from regression.random_images import random_image
 PIXELS = np.arange(24, dtype=np.float32).reshape(2, 4, 3)
 
 
-def test_an_image_comes_back_as_it_was_and_gives_the_same_bytes_again(tmp_path, np_rng):
+def test_images_round_trip_bit_by_bit(tmp_path, np_rng):
     before = random_image(np_rng)
     save_image(tmp_path / "a.exr", before)
     after = load_image(tmp_path / "a.exr")
@@ -135,7 +135,7 @@ UNUSABLE = {
 
 
 @pytest.mark.parametrize(("message", "write"), UNUSABLE.items(), ids=UNUSABLE)
-def test_what_is_wrong_is_said_with_the_file(tmp_path, message, write):
+def test_unusable_images_are_errors_that_name_the_file(tmp_path, message, write):
     path = tmp_path / "broken.exr"
     write(path)
     with pytest.raises(RegressionError, match=message) as error:

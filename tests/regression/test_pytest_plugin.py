@@ -82,7 +82,6 @@ def test_the_command_of_a_reference_gives_the_same_bytes(with_reference, monkeyp
 
 
 def test_update_writes_references_that_are_missing_or_damaged_or_of_another_size(project):
-    """What is wrong with them is told, and how to make them."""
     path = reference(project)
 
     def update(problem):
@@ -109,7 +108,7 @@ def test_a_failure_is_printed_once_and_a_folder_that_is_protected_does_not_hide_
     assert len(lines) == 1 + ("CI" in os.environ)
 
 
-def test_a_difference_fails_and_leaves_a_report_and_update_writes_only_what_differs(with_reference):
+def test_a_difference_fails_with_a_report_and_update_writes_only_differences(with_reference):
     before = reference(with_reference).read_bytes()
     with_reference.runpytest("--render-update").assert_outcomes(passed=1)
     assert reference(with_reference).read_bytes() == before
@@ -188,7 +187,7 @@ def test_blue(render_regression): scene = "blue/ball.xml"; {both}
     told.fnmatch_lines(["*is the reference of *red*ball.xml*, this test renders *blue*ball.xml*"])
 
 
-def test_what_is_not_decided_is_in_the_warnings_the_summary_and_junit(with_reference, monkeypatch):
+def test_undecided_comparisons_are_in_warnings_summary_and_junit(with_reference, monkeypatch):
     monkeypatch.setattr(variants, "_processor", lambda: "another")
     with_reference.makefile(".xml", ball=SCENE.replace('"0.5"', '"0.50002"'))
     result = with_reference.runpytest("--junitxml=junit.xml", "-W", "default")
@@ -202,7 +201,7 @@ def test_what_is_not_decided_is_in_the_warnings_the_summary_and_junit(with_refer
     failing(with_reference).stdout.fnmatch_lines(["*tile *fail*", "*compared all samples of the reference*"])
 
 
-def test_wrong_files_are_told_in_one_line_before_anything_is_rendered(with_reference, monkeypatch):
+def test_wrong_files_are_errors_of_one_line_before_rendering(with_reference, monkeypatch):
     def told(line, *options):
         result = failing(with_reference, *options)
         result.stdout.fnmatch_lines([line])

@@ -34,7 +34,7 @@ def test_shares_have_every_batch_once():
         assert [batch for share in shares for batch in share] == list(range(batches))
 
 
-def test_samples_come_in_whole_batches_of_which_there_are_four():
+def test_samples_come_in_four_whole_batches():
     for spp, *expected in ((256, 4, 64), (100, 4, 25), (1, 4, 1), (200, 4, 50), (300, 5, 64)):
         result = Sampling.of_spp(spp)
         assert [result.batches, result.batch] == expected
@@ -55,7 +55,7 @@ def test_passes_from_files_in_any_order_make_the_image(tmp_path, loaded):
     assert np.array_equal(direct.estimate.variance, merged.estimate.variance)
 
 
-def test_merging_by_steps_counts_all_batches_and_keeps_what_only_the_first_pass_has(loaded):
+def test_merging_by_steps_counts_all_batches_and_keeps_the_probe(loaded):
     passes = [render_pass(loaded, SAMPLING, i, 4, with_probe=True) for i in (1, 2, 3, 4)]
     assert [image.probe is not None for image in passes] == [True, False, False, False]
     # Ranges of batches interleave.
@@ -103,7 +103,7 @@ def test_every_file_of_a_scene_has_a_checksum(loaded, tmp_path):
     assert [name for name in loaded.files if changed.files[name] != loaded.files[name]] == ["cages/valence3.obj"]
 
 
-def test_scenes_that_cannot_be_rendered_are_refused(variants_all_rgb, tmp_path):  # noqa: ARG001
+def test_invalid_scenes_are_refused(variants_all_rgb, tmp_path):  # noqa: ARG001
     with pytest.raises(RegressionError, match="is not a file"):
         load_scene(tmp_path / "missing.xml")
     grey = {"type": "hdrfilm", "width": 4, "height": 4, "pixel_format": "luminance"}
@@ -209,7 +209,7 @@ EPYC = "processor\t: 0\nvendor_id\t: AMD\ncpu family\t: 26\nmodel\t\t: 2\nmodel 
 ARM = "processor\t: 0\nBogoMIPS\t: 243.75\nCPU implementer\t: 0x41\nCPU architecture: 8\nCPU part\t: 0xd40\n"
 
 
-def test_processors_of_one_name_are_told_apart_and_those_without_have_numbers():
+def test_processors_of_one_name_differ_by_model_numbers():
     """By what systems say of their first one, which cannot be had of others here."""
     another = "\nprocessor\t: 1\nmodel name\t: another one\n"
     assert variants._first_of(EPYC + another) == "EPYC, cpu family 26, model 2"
@@ -309,7 +309,7 @@ def test_a_cluster_gives_the_bits_of_one_machine_although_a_worker_dies(tmp_path
     assert load_image("together_0005.exr").probe is not None
 
 
-def test_no_cluster_is_said():
+def test_a_missing_cluster_is_an_error():
     pytest.importorskip("distributed")
     with pytest.raises(RegressionError, match="no Dask scheduler"):
         render_on_cluster("nonsense://", load_scene, None, 0)

@@ -94,7 +94,6 @@ def test_the_ends_of_the_scale_are_the_differences_they_say(monkeypatch):
 
 
 def test_equal_pictures_are_shown_alike_and_a_circle_is_around_the_worst_pixel_of_others(failed, reports):
-    """With white for the brightest."""
     panels = reports[0][1]
     reference, test = (panels[name].images[0].get_array() for name in ("Reference", "Test"))
     np.testing.assert_array_equal(reference, test)
@@ -106,7 +105,7 @@ def test_equal_pictures_are_shown_alike_and_a_circle_is_around_the_worst_pixel_o
         assert ("Dashed circle: worst pixel" in page.read_text()) == bool(centre)
 
 
-def test_the_picture_has_every_panel_with_colours_and_outlines_of_what_they_say(failed, reports):
+def test_the_picture_has_every_panel_with_its_colours_and_outlines(failed, reports):
     panels = reports[1][1]
     assert list(panels) == PANELS
     evidence, angle = (panels[name].images[0] for name in ("Evidence against noise", "Angle between normals"))

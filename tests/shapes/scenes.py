@@ -33,7 +33,6 @@ def rays(o, d):
 
 
 def down(x=0.1, y=0.2, z=5):
-    """A ray from above."""
     return mi.Ray3f(mi.Point3f(x, y, z), mi.Vector3f(0, 0, -1))
 
 

@@ -50,7 +50,7 @@ def test_every_variant_has_the_same_triangles_on_the_surface():
 
 @scalar
 @pytest.mark.parametrize(("size", "fov"), [((60, 40), 70.0), ((40, 60), 20.0)])
-def test_the_smallest_pixels_are_those_in_the_corners_of_the_film(size, fov):
+def test_pixels_are_smallest_in_the_corners_of_the_film(size, fov):
     """By Mitsuba's own rays: how far two of them are apart at a distance of one, side by side, from a depth of one."""
     given = view(size, fov)
     sensor, to_world = mi.load_dict(given), np.array(given["to_world"].matrix, dtype=np.float64)

@@ -35,7 +35,7 @@ def test_rendering_takes_the_same_kernels_wherever_arrays_lie():
 
 
 @every_variant
-def test_attributes_that_mitsuba_cannot_evaluate_are_told_of_and_no_parameters():
+def test_unsupported_attributes_warn_and_are_no_parameters():
     pair = 'attribute "pair" has 2 numbers per value and is left out; Mitsuba evaluates attributes of 1 or'
     normals = 'attribute "normals" is left out; every Mitsuba mesh has "normals" already'
     for name, width, message in (("normals", 3, normals), ("pair", 2, pair)):
@@ -81,7 +81,7 @@ def square_shape(square, shading):
 
 @shadings
 @pytest.mark.usefixtures("variants_all")
-def test_attributes_of_a_file_are_those_of_mitsubas_own_shape(square, shading):
+def test_attributes_of_a_file_equal_those_of_mitsubas_ply(square, shading):
     ours, theirs = square_shape(square, shading), mi.load_dict({"type": "ply", "filename": square})
     wavelengths = [450, 500, 550, 600] if mi.is_spectral else []
     by_shape = []
@@ -111,7 +111,6 @@ def test_attributes_of_a_file_are_those_of_mitsubas_own_shape(square, shading):
 @shadings
 @pytest.mark.usefixtures("variant_llvm_ad_spectral")
 def test_spectra_have_derivatives_by_colours(square, shading):
-    """Of one constant colour, against differences."""
     shape = square_shape(square, shading)
     scene = scene_with(shape=shape)
 
@@ -191,7 +190,7 @@ def test_textured_emitters_light_as_with_vertex_shading(kind, displacement):
 
 
 @every_variant
-def test_what_users_assign_to_vertices_stays_until_the_cage_is_updated_for_which_alone_weights_are_made(monkeypatch):
+def test_assigned_vertex_attributes_stay_until_the_cage_attribute_is_updated(monkeypatch):
     shape = load(with_attributes(cube()))
     parameters = mi.traverse(shape)
     assigned = upload(type(parameters["vertex_colour"]), 0.5 * np.array(parameters["vertex_colour"]))

@@ -64,7 +64,7 @@ EXACT = [
     [*(("vertex", *case) for case in BOTH), *(pytest.param("exact", *case, marks=exact) for case in BOTH + EXACT)],
     indirect=["named"],
 )
-def test_derivatives_of_what_rays_meet_are_differences(named, by, parameters, shading, np_rng):
+def test_derivatives_of_hits_are_differences(named, by, parameters, shading, np_rng):
     (cage, scheme), has_texels = named, "displacement.data" in by
     given = {**parameters, "displacement": bitmap(IMAGE)} if has_texels else parameters
     to_world = mi.ScalarTransform4f(MIRRORED)

@@ -293,7 +293,7 @@ def test_an_update_that_is_refused_changes_nothing_else_until_it_is_right(refuse
     ("valence", "scale", "beside", "off"),
     [*((valence, 1, BESIDE, AROUND) for valence in (3, 6, 9)), (5, [1, 1, 0], 2 * STEP, 1e-3)],
 )
-def test_normals_at_extraordinary_vertices_go_with_those_around_them(valence, scale, beside, off):
+def test_normals_are_continuous_at_extraordinary_vertices(valence, scale, beside, off):
     """Curvature, which the normal there does without, turns it a little; in a plane, it is the limit."""
     plain = named_cages.extraordinary(valence, closed=scale == 1)
     cage = with_heights(plain.with_positions(plain.positions * scale))
@@ -313,7 +313,7 @@ def test_normals_at_extraordinary_vertices_go_with_those_around_them(valence, sc
 
 
 @every_variant
-def test_normals_where_seams_end_at_extraordinary_vertices_are_those_of_the_limit_surface():
+def test_normals_at_ends_of_seams_are_undisplaced_at_extraordinary_vertices():
     cage = CAGES["islands"]()
     p, n = vertices(load(cage, tessellation_rate=RATE))
     corners = np.linalg.norm(p - LimitSurface(cage).evaluate(0, [[0, 0]]).p, axis=1) < SINGLE
@@ -357,7 +357,7 @@ def attached_slopes(heights, s, t):
 
 @pytest.mark.parametrize("turn", [0, 90])
 @every_ad_variant
-def test_slopes_of_a_bitmap_turn_with_texture_coordinates_and_those_of_texels_are_zero(turn):
+def test_bitmap_slopes_follow_texture_coordinates(turn):
     """Of a bitmap of texels of a quadratic function, whose differences over a texel are its second derivatives."""
     height, width = 9, 16
     y, x = np.meshgrid((np.arange(height) + 0.5) / height, (np.arange(width) + 0.5) / width, indexing="ij")
@@ -381,7 +381,7 @@ def test_slopes_of_a_bitmap_turn_with_texture_coordinates_and_those_of_texels_ar
 
 
 @every_variant
-def test_ranges_are_those_of_texels_of_luminances_of_samples_and_of_an_attributes_values():
+def test_height_ranges_cover_textures_and_attributes():
     # At texels' centres a texture has their luminances, and beyond the picture no others.
     colours = heights_of(bitmap(np.random.default_rng(8).random((3, 5, 3)).astype(np.float32)))
     s, t = (grid.ravel() for grid in np.meshgrid((np.arange(5) + 0.5) / 5, (np.arange(3) + 0.5) / 3))

@@ -134,7 +134,7 @@ MIRRORED = np.diag([-1, 1, 1, 1]) @ SHEARED
         ("Doo-Sabin cube", SHEARED, False),
     ],
 )
-def test_hits_are_those_of_the_limit_surface(name, matrix, flips, np_rng):
+def test_hits_lie_on_the_limit_surface(name, matrix, flips, np_rng):
     """Of rays at points all over it; derivatives by texture coordinates where there are any, in the world."""
     made, scheme = SURFACES[name]
     cage, (linear, offset), step = made(), (matrix[:3, :3], matrix[:3, 3]), 1e-4
@@ -302,7 +302,7 @@ def test_materials_look_the_same_at_every_rate():
         assert (apart > 0.1).mean() < 0.02, name
 
 
-def test_emitters_light_a_floor_whichever_strategy_finds_them():
+def test_emitters_light_a_floor_with_every_sampling_strategy():
     """Emitters are sampled on triangles; what hits them counts with the weight of that place and normal."""
     below, dark = mi.ScalarTransform4f().translate([0, 0, -1.2]).scale(3), {"type": "constant", "radiance": 1e-6}
     floor, emitter = {"type": "rectangle", "to_world": below}, {"type": "area", "radiance": rgb(1, 1, 1)}
@@ -321,7 +321,7 @@ def test_emitters_light_a_floor_whichever_strategy_finds_them():
 
 
 @pytest.mark.parametrize("eye", [(0.3, -0.2, 5), (0.3, -0.2, -5)])
-def test_attributes_are_those_of_the_surface_on_both_sides(eye, np_rng):
+def test_attributes_agree_on_both_sides(eye, np_rng):
     """`twosided` turns the direction to the viewer over where it shows the back."""
     heat = upload(mi.TensorXf, np_rng.uniform(size=(81, 1)))
     bsdf = {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": attribute("heat")}}

@@ -84,7 +84,7 @@ def test_updates_inside_of_a_frozen_function_are_recorded(shading, by, given):
         pytest.param("exact", ("cage_colour",), {}, True, marks=exact),
     ],
 )
-def test_gradients_of_frozen_pictures_and_of_whole_steps_are_those_of_others(shading, by, given, is_whole):
+def test_frozen_gradients_equal_plain_ones(shading, by, given, is_whole):
     def picture(scene, parameters, seed):
         dr.backward(dr.mean(dr.square(mi.render(scene, parameters, spp=2, seed=seed) - 0.5), axis=None))
 
@@ -108,7 +108,7 @@ def test_gradients_of_frozen_pictures_and_of_whole_steps_are_those_of_others(sha
     assert function.n_recordings == 2
 
 
-def test_what_a_frozen_function_cannot_do_is_told():
+def test_unsupported_updates_in_frozen_functions_are_errors():
     """Mitsuba's own meshes cannot, either; and Dr.Jit goes on reading triangles that it has read."""
 
     def step(scene, parameters, values):

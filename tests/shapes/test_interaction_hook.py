@@ -83,7 +83,7 @@ def shape(shading):
 
 
 @every_array_variant
-def test_an_error_is_raised_by_what_caused_it_and_by_nothing_else(monkeypatch, capfd):
+def test_an_error_is_raised_once_by_its_cause(monkeypatch, capfd):
     shape = make(vertex_heat=upload(mi.TensorXf, np.arange(8.0)[:, None]))
     scene, si = scene_of(shape), hit(shape, *TOP)
     instances = scene_with(group=members(0, 1), instance=instance("group", 1))
@@ -171,7 +171,7 @@ print(len({ask() for _ in range(3)}))
 
 
 @llvm
-def test_mitsubas_own_errors_are_those_of_vertex_shading():
+def test_mitsuba_errors_are_the_same_in_both_shadings():
     """An exception of C++ passes by Python: flags, sizes and indices that do not fit are errors, and no crash."""
     rays, top = down([0.13, 0, 0.1], 0.21, 4), down(*TOP)
     flags = mi.RayFlags.DetachShape | mi.RayFlags.FollowShape
@@ -207,9 +207,8 @@ def interrupt():
     sent = time.monotonic()
     os.kill(os.getpid(), signal.SIGINT)
 mi.set_log_level(mi.LogLevel.Error)
-film = {"type": "hdrfilm", "width": 8, "height": 8}
-to_world = mi.ScalarTransform4f().look_at([1, 2, 3], [0, 0, 0], [0, 0, 1])
-sensor = {"type": "perspective", "to_world": to_world, "film": film}
+sensor = {"type": "perspective", "film": {"type": "hdrfilm", "width": 8, "height": 8}}
+sensor["to_world"] = mi.ScalarTransform4f().look_at([1, 2, 3], [0, 0, 0], [0, 0, 1])
 for shading in ("vertex", "exact"):
     shapes = {f"shape{i}": shape(shading) for i in range(15)}
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "path"}, "sensor": sensor, **shapes})

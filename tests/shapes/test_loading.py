@@ -110,7 +110,7 @@ def test_a_constructor_too_deep_runs_in_its_own_thread():
 
 
 @scalar
-def test_the_collector_rests_while_a_shape_is_made_and_is_as_it_was_afterwards(monkeypatch):
+def test_the_collector_pauses_while_a_shape_is_made(monkeypatch):
     read_parameters, enabled = subdivision_shape.read_parameters, []
 
     def noted(props):
@@ -192,7 +192,7 @@ OTHER_TAGS += [{"face_varying": "all"}]
 
 @scalar
 @pytest.mark.parametrize("tags", OTHER_TAGS, ids=str)
-def test_shapes_of_other_tags_rules_or_schemes_share_no_patches_and_those_of_another_rate_only_these(tags):
+def test_only_shapes_of_equal_topology_share_patches(tags):
     one, of_rate = load(cube()), load(cube(), tessellation_rate=3)
     for two in (load(cube(**tags)), load(cube(), scheme="doo_sabin"), of_rate):
         assert one._mesh.table is not two._mesh.table
@@ -201,7 +201,7 @@ def test_shapes_of_other_tags_rules_or_schemes_share_no_patches_and_those_of_ano
 
 @every_variant
 @shadings
-def test_shapes_of_equal_cages_share_arrays_until_those_of_one_change(shading):
+def test_shapes_of_equal_cages_share_arrays_until_an_update(shading):
     points, is_jit = cube().positions, dr.is_jit_v(mi.Float)
     cage = cube(creases=RING, texcoords=points[:, :2], attributes={"colour": points})
     given = cage, cage, cage.with_positions(-cage.positions)
@@ -286,7 +286,7 @@ def test_a_file_is_read_once_until_it_changes_and_warned_of_by_each_shape(tmp_pa
         np.testing.assert_array_equal(cages[-1].positions[:8], positions)
 
 
-def test_only_usd_files_refer_to_others_which_may_change_alone():
+def test_only_usd_files_refer_to_other_files():
     assert {suffix for suffix, file_format in FORMATS.items() if not file_format.refers_to_files} == {".obj", ".ply"}
 
 

@@ -93,7 +93,7 @@ def changed(mesh, bsdf, texture, path):
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb", "no_other_scene")
 @shadings
-def test_methods_are_those_of_a_mesh_of_the_same_triangles(shading, tmp_path):
+def test_methods_agree_with_a_mesh_of_the_same_triangles(shading, tmp_path):
     shape = made(shading)
     names = ["positions", "color", "weight"] + ["normals", "texcoords"] * (shading == "vertex")
     buffers = {"face_element": buffer(shape, "face_element")[:, None]}

@@ -64,7 +64,7 @@ def test_a_description_names_all_choices(row):
 
 
 @pytest.mark.parametrize("row", [row for row in ROWS if row.default is not None], ids=lambda row: row.name)
-def test_a_stated_default_is_the_value_as_scene_files_have_it(row):
+def test_stated_defaults_are_the_values_in_scene_files(row):
     quoted, number = re.search(r"\(Default: (?:``(.*)``|(.*))\)$", row.text).groups()
     read = {bool: {"true": True, "false": False}.get, str: str}.get(type(row.default), float)
     assert read(quoted or number) == row.default
@@ -96,6 +96,6 @@ def test_a_parameter_takes_the_numbers_that_its_message_states_and_no_others(row
             row.checked(value)
 
 
-def test_names_with_placeholders_are_those_of_attributes():
+def test_placeholders_stand_for_attributes():
     of_attributes = {name for name in PARAMETER_OF_NAME if is_attribute_parameter(name)}
     assert {name for name in PARAMETER_OF_NAME if "NAME" in name} == of_attributes - {"texcoords", "texcoord_indices"}

@@ -131,7 +131,7 @@ def shading_of(shape):
 
 
 @every_variant
-def test_a_shape_says_what_became_of_its_shading():
+def test_a_shape_states_its_shading():
     expected = "exact" if problem() is None else "vertex"
     assert (expected == "exact") == (not mi.variant().startswith("scalar") and hook_problem() is None)
     automatic, given = (load(cube(), shading=shading) for shading in ("auto", expected))

@@ -81,7 +81,7 @@ def test_buffers_are_the_tessellation(name, mirror):
 
 @with_warnings
 @every_variant
-def test_strict_shapes_refuse_what_is_no_manifold():
+def test_strict_shapes_refuse_non_manifold_cages():
     with pytest.raises(Exception, match="expected a manifold surface"):
         load(NON_MANIFOLD["book"](), strict=True)
 
@@ -172,7 +172,6 @@ def triangles(part):
 @scalar
 @pytest.mark.parametrize("given", [{"tessellation_rate": 3}, {"tessellation": "adaptive", "max_edge": 0.4}], ids=str)
 def test_materials_share_their_vertices_bit_by_bit_and_unknown_ones_are_errors(tmp_path, given):
-    """Of a cube, one of which is used twice, with a crease between two."""
     cube(creases=[(0, 1, 10)]).save(tmp_path / "plain.obj")
     names, text = {face: name for name, faces in MATERIALS.items() for face in faces}, []
     for line in (tmp_path / "plain.obj").read_text().splitlines():

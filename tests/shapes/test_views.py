@@ -1,5 +1,3 @@
-"""Gradients of several views, and of outlines: what silently went missing, or came twice."""
-
 import gc
 import weakref
 
@@ -104,7 +102,7 @@ def texels():
         pytest.param((POINTS, "cage_colour", "cage_texcoords"), None, "exact", marks=exact),
     ],
 )
-def test_gradients_of_views_are_those_of_their_sum_alone_and_together(names, displacement, shading):
+def test_gradients_of_views_add_up(names, displacement, shading):
     heights = {} if displacement is None else {"displacement": displacement, SCALE: 0.1}
     if displacement == "bitmap":
         heights["displacement"] = texels()
@@ -130,7 +128,7 @@ def test_gradients_of_views_are_those_of_their_sum_alone_and_together(names, dis
         np.testing.assert_allclose(gradient, expected, rtol=0, atol=10 * ROUNDING * largest, err_msg=key)
 
 
-def test_what_users_assign_to_vertices_stays_when_gradients_pass():
+def test_assigned_vertices_stay_when_gradients_pass():
     scene, key = views_of("prb"), "shape.vertex_positions"
     parameters = mi.traverse(scene)
     points = differentiated(parameters, KEY)
@@ -152,7 +150,7 @@ def test_what_users_assign_to_vertices_stays_when_gradients_pass():
         (SCALE, texels, "control_points, to_world or heights"),
     ],
 )
-def test_gradients_that_end_at_the_shape_are_told_of(name, displacement, told):
+def test_gradients_that_end_at_the_shape_warn(name, displacement, told):
     key, heights = f"shape.{name}", {"displacement": displacement()} if displacement else {}
     scene = views_of("prb", COLOURED, **COLOUR, **heights)
     parameters, size = mi.traverse(scene), dr.opaque(mi.Float, 1)
@@ -180,7 +178,7 @@ def test_gradients_that_end_at_the_shape_are_told_of(name, displacement, told):
     assert dr.grad(size)[0] == pytest.approx(second, rel=1e-4)
 
 
-def test_losses_of_views_are_those_of_the_views():
+def test_losses_of_views_add_up():
     scene = views_of("prb")
     parameters, seen = mi.traverse(scene), []
 

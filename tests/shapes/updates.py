@@ -16,7 +16,6 @@ def update(of, values=(), **named):
 
 
 def differentiated(parameters, key):
-    """Have a parameter differentiated, as an array that is assigned to it."""
     values = type(parameters[key])(dr.detach(parameters[key]))
     dr.enable_grad(values)
     update(parameters, {key: values})

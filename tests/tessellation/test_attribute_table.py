@@ -96,7 +96,7 @@ def test_vertices_are_split_where_seams_or_creases_are_only(scheme, cage, np_rng
 
 
 @pytest.mark.parametrize("scheme", ["catmull_clark", "doo_sabin"])
-def test_without_seams_the_vertices_are_those_of_the_surface(scheme, np_rng):
+def test_attributes_without_seams_use_the_vertices_of_the_surface(scheme, np_rng):
     cage = bumpy(mixed_torus())
     colour = np_rng.random((cage.vertex_count, 3))
     surface = LimitSurface(tagged(cage, attributes={"colour": Attribute(colour)}), scheme)

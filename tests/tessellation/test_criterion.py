@@ -330,7 +330,7 @@ def test_a_bump_in_the_middle_of_a_face_is_seen_however_narrow():
     assert triangles_with_heights(surface, 0.05, 1.0, bump) > 2 * flat
 
 
-def test_a_displaced_border_has_what_the_displacement_leaves_of_the_limit():
+def test_displacement_tightens_the_limit_of_borders():
     """On a flat sheet with a curved border, heights that take most of the limit leave the border a tenth."""
     flat = triangles_with_heights(FLAT, 1e-2, 1e-2, lambda uv: 0 * uv[:, 0])
     assert triangles_with_heights(FLAT, 1e-2, 1e-2, lambda uv: 0.9e-2 * (uv[:, 0] > 0.5)) > flat

@@ -1,5 +1,3 @@
-"""Extents of surfaces over tiles, against samples: never said to be smaller, and hardly ever larger."""
-
 from __future__ import annotations
 
 import copy

@@ -149,7 +149,7 @@ OF_ANOTHER_CAGE = (np.zeros((5, 3)), np.zeros((9, 3)), np.full((8, 3), np.nan))
         (lambda _, error: Criterion(Measure.CHORD, error), (-1e-3, np.nan), "expected a number from 0 on"),
     ],
 )
-def test_what_makes_no_tessellation_is_an_error(make, values, message):
+def test_invalid_tessellation_options_are_errors(make, values, message):
     for value in values:
         with pytest.raises(ValueError, match=message):
             make(LimitSurface(named_cages.cube()), value)
