@@ -1,9 +1,10 @@
 """A script for Blender: makes scenes.
 
-``blender -b --python scenes.py -- model MODEL.blend ANSWERS.json`` tells what Blender's own subdivision of it is. From
-Blender 5.0 on, its own exporter writes the scene as well, beside the model: ``own.usda``.
+``blender -b --python scenes.py -- model MODEL.blend ANSWERS.json`` tells what Blender's own subdivision of it is.
 
 ``blender -b --python scenes.py -- look LOOK.blend PICTURE.exr`` renders the scene with Cycles.
+
+``blender -b --python scenes.py -- shown SHOWN.blend POINTS.json`` tells the points of each object in a render.
 """
 
 import itertools
@@ -24,6 +25,8 @@ FACES = [*SIDES, *((i, (i + 1) % 5, 14) for i in range(5)), (6, 5, 10, 13, 11), 
 # Of edges, by their vertices, and of vertices.
 EDGE_CREASES = {(0, 1): 1.0, (1, 2): 0.5, (2, 7): 0.3, (5, 10): 0.6, (10, 13): 0.4, (0, 5): 0.2, (8, 9): 0.7}
 VERTEX_CREASES = {4: 0.55, 9: 1.0, 13: 0.3}
+CORNERS = list(itertools.product((-1.0, 1.0), repeat=3))
+SQUARES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
 TETRAHEDRON = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
 BOUNDARIES, UV_RULES = (
     bpy.types.SubsurfModifier.bl_rna.properties[name].enum_items.keys() for name in ("boundary_smooth", "uv_smooth")
@@ -164,8 +167,108 @@ def make_model(model, answers):
     bpy.ops.wm.open_mainfile(filepath=model)
     with open(answers, "w") as file:
         json.dump({name: subdivided(bpy.data.objects[name]) for name in compared}, file)
-    if bpy.app.version >= (5, 0):
-        bpy.ops.wm.usd_export(filepath=os.path.join(os.path.dirname(model), "own.usda"))
+
+
+def make_shown(model, points):
+    """What a viewport shows otherwise than a render, with an animation of three frames, and its points in a render."""
+    scene, nodes = bpy.context.scene, bpy.data.node_groups.new("Nodes", "GeometryNodeTree")
+    scene.frame_end, scene.render.use_simplify, scene.render.simplify_subdivision = 3, True, 0
+
+    def cube(name, *modifiers, parts=None):
+        thing = add(name, bpy.data.meshes.new(name), (2.5 * len(bpy.data.objects), 0, 0))
+        thing.data.from_pydata(CORNERS, [], SQUARES)
+        if parts:
+            scene.collection.objects.unlink(thing)
+            parts.objects.link(thing)
+        return thing, *(thing.modifiers.new(kind.title(), kind) for kind in modifiers)
+
+    parts, hidden = bpy.data.collections.new("Parts"), bpy.data.collections.new("Hidden")
+    scene.collection.children.link(hidden)
+    hidden.hide_render = True
+    cube("absent", parts=hidden)
+    part, subdivision = cube("part", "SUBSURF", parts=parts)
+    subdivision.render_levels = 2
+    cube("unseen")[0].hide_viewport = True
+    _, screw = cube("screw", "SCREW")
+    screw.steps, screw.render_steps = 3, 9
+    for name, kind in (("curve", "CURVE"), ("wire", "CURVE"), ("text", "FONT")):
+        curve = bpy.data.curves.new(name, kind)
+        curve.resolution_u, curve.render_resolution_u, curve.bevel_depth = 2, 5, 0.1
+        if kind == "FONT":
+            curve.body = "o"
+        else:
+            curve.splines.new("BEZIER").bezier_points.add(1)
+            curve.splines[0].bezier_points[1].co = curve.splines[0].bezier_points[1].handle_left = (1, 1, 0)
+        add(name, curve, (0, 3, 0))
+    bpy.data.objects["wire"].modifiers.new("Subdivision", "SUBSURF")
+    bpy.ops.surface.primitive_nurbs_surface_sphere_add(location=(0, 6, 0))
+    bpy.context.object.name = "spline"
+    balls = bpy.data.metaballs.new("balls")
+    balls.elements.new()
+    add("balls", balls, (3, 6, 0))
+    holder = add("holder", None, (0, 9, 0))
+    holder.instance_type, holder.instance_collection = "COLLECTION", parts
+    frame = cube("frame")[0]
+    frame.instance_type, frame.show_instancer_for_render = "VERTS", False
+    cube("child")[0].parent = frame
+    hairs = cube("emitter", "PARTICLE_SYSTEM")[1].particle_system.settings
+    hairs.type, hairs.count, hairs.render_type, hairs.instance_object = "HAIR", 5, "OBJECT", part
+    # Geometry nodes that instance a part at three points of a line.
+    for way in ("INPUT", "OUTPUT"):
+        nodes.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
+    info, line, on_points, join, start, end = (
+        nodes.nodes.new(kind)
+        for kind in ("GeometryNodeObjectInfo", "GeometryNodeMeshLine", "GeometryNodeInstanceOnPoints",
+                     "GeometryNodeJoinGeometry", "NodeGroupInput", "NodeGroupOutput")
+    )  # fmt: skip
+    info.inputs["Object"].default_value, info.inputs["As Instance"].default_value = part, True
+    line.inputs["Count"].default_value = 3
+    for source, name, target, socket in (
+        (line, 0, on_points, "Points"), (info, "Geometry", on_points, "Instance"), (on_points, 0, join, 0),
+        (start, 0, join, 0), (join, 0, end, 0),
+    ):  # fmt: skip
+        nodes.links.new(source.outputs[name], target.inputs[socket])
+    cube("nodes", "NODES")[1].node_group = nodes
+    cube("thick", "SUBSURF", "SOLIDIFY")
+    # What moves.
+    key, _ = cube("key", "SUBSURF")
+    key.shape_key_add(name="Basis")
+    shape = key.shape_key_add(name="Larger")
+    for point in shape.data:
+        point.co = 2 * point.co
+    camera, sun = bpy.data.cameras.new("Camera"), bpy.data.lights.new("Sun", "SUN")
+    camera.type, scene.camera = "ORTHO", add("Camera", camera, (0, -30, 0), (math.pi / 2, 0, 0))
+    sun.angle, scene.render.use_motion_blur, scene.render.motion_blur_shutter = 0.01, True, 0.5
+    add("Sun", sun).scale = (2, 2, 2)
+    for owner, name, values in (
+        (shape, "value", (0.0, 1.0)), (camera, "ortho_scale", (40.0, 60.0)), (sun, "energy", (1.0, 3.0)),
+        (holder, "location", ((0, 9, 0), (0, 9, 4))),
+    ):  # fmt: skip
+        for frame, value in zip((1, 3), values, strict=True):
+            setattr(owner, name, value)
+            owner.keyframe_insert(name, frame=frame)
+    scene.frame_set(1)
+    bpy.ops.wm.save_as_mainfile(filepath=model)
+    found = {}
+
+    class Seen(bpy.types.USDHook):
+        bl_idname, bl_label = "seen", "Points of a render"
+
+        @staticmethod
+        def on_export(context):
+            for each in context.get_depsgraph().object_instances:
+                if each.show_self and each.object.type == "MESH":
+                    points = [tuple(each.matrix_world @ vertex.co) for vertex in each.object.data.vertices]
+                    found.setdefault(each.object.name, []).append(points)
+            return True
+
+    bpy.utils.expose_bundled_modules()
+    from pxr import Usd  # noqa: F401, for the context
+
+    bpy.utils.register_class(Seen)
+    bpy.ops.wm.usd_export(filepath=model + ".usda", evaluation_mode="RENDER")
+    with open(points, "w") as file:
+        json.dump(found, file)
 
 
 TEXELS = 32
@@ -274,10 +377,22 @@ def tiles(folder):
     tile.tree.links.new(tile.picture(dents)["Color"], turned.inputs["Color"])
     tile.set("Normal", turned.outputs["Normal"])
     tile = Tile()
-    tile.color(ramp, tile.node("ShaderNodeUVMap", uv_map="Second").outputs["UV"])
+    product = tile.node("ShaderNodeMix", data_type="RGBA", blend_type="MULTIPLY")
+    product.inputs[0].default_value, product.inputs[7].default_value = 1.0, (0.9, 0.4, 0.6, 1.0)
+    picture = tile.picture(ramp, tile.node("ShaderNodeUVMap", uv_map="Second").outputs["UV"])
+    tile.tree.links.new(picture["Color"], product.inputs[6])
+    tile.set("Base Color", product.outputs[2])
     Tile(Alpha=0.5, Base_Color=(0.9, 0.2, 0.1, 1.0))
     tile = Tile()
     tile.color(ramp, tile.node("ShaderNodeUVMap", uv_map="Main").outputs["UV"])
+    tile = Tile()
+    colors = bpy.data.meshes[f"tile_{tile.number}"].color_attributes.new("Tint", "FLOAT_COLOR", "POINT").data
+    colors.foreach_set("color", [1.0, 0.2, 0.1, 1.0] * 2 + [0.2, 0.5, 1.0, 1.0] * 2)
+    tile.set("Base Color", tile.node("ShaderNodeVertexColor", layer_name="Tint").outputs["Color"])
+    tile = Tile()
+    emission = tile.node("ShaderNodeEmission")
+    emission.inputs["Color"].default_value = (0.2, 0.6, 0.1, 1.0)
+    tile.tree.links.new(emission.outputs[0], tile.tree.nodes["Material Output"].inputs["Surface"])
 
 
 def what_is_left_out():
@@ -285,18 +400,9 @@ def what_is_left_out():
     tile = Tile()
     thing = bpy.data.objects[f"tile_{tile.number}"]
     thing.location, thing.visible_shadow = (0, -30, 0), False
-    noise = tile.node("ShaderNodeTexNoise")
-    tile.set("Base Color", noise.outputs["Color"])
-    ramp = bpy.data.images["ramp.png"]
-    place = mapping(tile.tree, tile.node("ShaderNodeTexCoord").outputs["Object"], rotation=(0.5, 0, 0))
-    tile.set("Roughness", tile.picture(ramp, place, interpolation="Closest")["Color"])
-    bump = tile.node("ShaderNodeBump")
-    tile.tree.links.new(noise.outputs[0], bump.inputs["Height"])
-    tile.set("Normal", bump.outputs["Normal"])
-    if bpy.app.version >= (4, 0):
-        values = {"Sheen Weight": 0.3, "Coat Weight": 0.5, "Coat IOR": 1.8, "Subsurface Weight": 0.1}
-        for name, value in {**values, "Anisotropic": 0.5}.items():
-            tile.surface.inputs[name].default_value = value
+    tile.tree.links.new(
+        tile.node("ShaderNodeBsdfGlass").outputs[0], tile.tree.nodes["Material Output"].inputs["Surface"]
+    )
     lamp = bpy.data.lights.new("Lamp", "AREA")
     lamp.spread, lamp.energy = 1.0, 0.0
     add("Lamp", lamp)
@@ -354,4 +460,4 @@ def make_look(model, picture):
 if __name__ == "__main__":
     kind, *paths = sys.argv[sys.argv.index("--") + 1 :]
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    (make_model if kind == "model" else make_look)(*paths)
+    {"model": make_model, "look": make_look, "shown": make_shown}[kind](*paths)
