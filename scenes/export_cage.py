@@ -2,15 +2,14 @@
 
     blender -b model.blend --python export_cage.py -- model.usda
     blender -b model.blend --python export_cage.py -- model.obj --object Chair
+    python export_cage.py model.usda --blend model.blend
 
 Each function of ``MENDS`` mends faults of the exporter, which its docstring names; all were seen in Blender 4.5.1 and
 5.0.1. Where Blender mends them, the function goes. Above all, an object with a Subdivision Surface modifier becomes its
 cage: the mesh that the last such modifier gets, with the modifiers above it applied and those below it left out.
 
-Installed as an add-on (Preferences, Add-ons, Install from Disk), this file mends what File > Export > Universal Scene
-Description writes. As a script it needs Blender 4.5 or newer, or a Python that has the package bpy:
-
-    python export_cage.py model.usda --blend model.blend
+It needs Blender 4.5 or newer, or a Python that has the package bpy. Installed as an add-on (Preferences, Add-ons,
+Install from Disk), this file mends what File > Export > Universal Scene Description writes.
 """
 
 import argparse
@@ -19,7 +18,6 @@ import math
 import os
 import re
 import sys
-import traceback
 
 import bpy
 import mathutils
@@ -40,28 +38,20 @@ FACE_VARYING = {
 INFINITE = 10.0  # OpenSubdiv's infinite sharpness.
 ROUNDING = 1e-4  # Of angles and transforms in single precision.
 GREY = (0.8, 0.8, 0.8)  # Of faces without a material.
-# Inputs of the Principled BSDF, and of OpenPBR.
+# Inputs of OpenPBR by those of the Principled BSDF, and colour and other inputs for the nodes of other surfaces.
 INPUTS = {
     "Base Color": "base_color", "Metallic": "base_metalness", "Roughness": "specular_roughness",
     "Alpha": "geometry_opacity", "Emission Color": "emission_color", "Normal": "geometry_normal",
 }  # fmt: skip
-# Nodes of colours that become others: constants and mixtures, or attributes.
-CONSTANT, ATTRIBUTES = ("RGB", "VALUE", "MIX", "MIX_RGB"), ("VERTEX_COLOR", "ATTRIBUTE")
-# Nodes of MaterialX for blends of colours.
-BLENDS = {"ADD": "plus", "SUBTRACT": "minus", "SCREEN": "screen", "OVERLAY": "overlay", "DIFFERENCE": "difference"}
-# Colour and other inputs of OpenPBR for a node of another surface.
 DIFFUSE = "base_color", {"specular_weight": 0.0}
 EMISSION = "emission_color", {"base_weight": 0.0, "specular_weight": 0.0, "emission_luminance": 1.0}
 SURFACES = {"ND_oren_nayar_diffuse_bsdf": DIFFUSE, "ND_burley_diffuse_bsdf": DIFFUSE, "ND_uniform_edf": EMISSION}
+BLENDS = {"ADD": "plus", "SUBTRACT": "minus", "SCREEN": "screen", "OVERLAY": "overlay", "DIFFERENCE": "difference"}
+ATTRIBUTES = ("VERTEX_COLOR", "ATTRIBUTE")
 # From Blender's axes to those of a dome: the middle of an image is at x instead of z, and z is up instead of y.
 DOME = mathutils.Matrix(((0, 0, 1), (1, 0, 0), (0, 1, 0)))
-SHUTTERS = {"START": 0.0, "CENTER": -0.5, "END": -1.0}  # Where shutters open, in times of the shutter.
 OBJECT_NAME, DATA_NAME = "userProperties:blender:object_name", "userProperties:blender:data_name"
 KINDS = Sdf.ValueTypeNames
-
-
-class ExportError(Exception):
-    """What a user can change: the scene, or the arguments."""
 
 
 @functools.cache  # Once.
@@ -76,26 +66,18 @@ class Export:
     def __init__(self, stage, depsgraph):
         self.stage, self.depsgraph, self.scene = stage, depsgraph, depsgraph.scene
         self.root, self.time = stage.GetDefaultPrim(), Usd.TimeCode.Default()
-        self.values, self.places = {}, {}  # Of attributes, and last times of what is written, by path.
+        self.values, self.written = {}, {}  # Of attributes, and last times of meshes and instances, by path.
         self.is_animated = stage.HasAuthoredTimeCodeRange()
         found = [prim for prim in stage.Traverse() if prim.IsA(UsdShade.Material) and prim.HasAttribute(DATA_NAME)]
         self.materials = {prim.GetAttribute(DATA_NAME).Get(): UsdShade.Material(prim) for prim in found}
         # Prims of objects themselves, by name; others with the name of an object are its instances.
         self.own, self.others, parents = {}, [], {self.root.GetPath(): None}
-        for prim in Usd.PrimRange(self.root):
-            thing = _object_of(prim)
-            if thing is None:
-                continue
+        for prim, thing in [(prim, _object_of(prim)) for prim in Usd.PrimRange(self.root) if _object_of(prim)]:
             names = re.sub(r"^\d|\W", "_", thing.name), Tf.MakeValidIdentifier(thing.name)
             if prim.GetName() in names and parents.get(prim.GetPath().GetParentPath(), thing) == thing.parent:
                 self.own[thing.name], parents[prim.GetPath()] = prim, thing
             else:
                 self.others.append(prim)
-
-    def objects(self, kind):
-        """Objects of a kind and their prims."""
-        found = [(bpy.data.objects[name], prim) for name, prim in self.own.items()]
-        return [(thing, prim) for thing, prim in found if kind in (None, thing.type)]
 
     def mend(self):
         """Call the mends, some of them where the scene is at each frame."""
@@ -112,11 +94,14 @@ class Export:
                 mend(self)
         if self.is_animated:
             self.scene.frame_set(before[0], subframe=before[1])
-        meshes(self)
 
     def put(self, attribute, value):
         """Author a value; it has samples from the frame on before which it moves."""
         path = attribute.GetPath()
+        if isinstance(value, np.ndarray):
+            width, is_integer = value.shape[1] if value.ndim == 2 else 1, value.dtype.kind == "i"
+            kind = Vt.IntArray if is_integer else (Vt.FloatArray, Vt.Vec2fArray, Vt.Vec3fArray)[width - 1]
+            value = kind.FromNumpy(np.ascontiguousarray(value, np.int32 if is_integer else np.float32))
         if path not in self.values:
             attribute.Clear()
             attribute.Set(value)
@@ -135,23 +120,12 @@ class Export:
         self.put((place.GetTransformOp() or place.AddTransformOp()).GetAttr(), Gf.Matrix4d(*numbers))
 
 
-def _array(values):
-    if values.dtype.kind == "i":
-        return Vt.IntArray.FromNumpy(np.ascontiguousarray(values, np.int32))
-    kind = {1: Vt.FloatArray, 2: Vt.Vec2fArray, 3: Vt.Vec3fArray}[values.shape[1] if values.ndim == 2 else 1]
-    return kind.FromNumpy(np.ascontiguousarray(values, np.float32))
-
-
 def _object_of(prim):
     return bpy.data.objects.get(prim.GetAttribute(OBJECT_NAME).Get() or "") if prim.HasAttribute(OBJECT_NAME) else None
 
 
 def _child(prim, schema, name):
-    """Path of the child of a prim that has a schema, or of one to be made."""
     return next((each.GetPath() for each in prim.GetChildren() if each.IsA(schema)), prim.GetPath().AppendChild(name))
-
-
-# Meshes
 
 
 def subdivision_of(thing):
@@ -181,35 +155,27 @@ def write_cage(export, path, thing):
 
 
 def write_mesh(export, path, mesh, slots, name, modifier=None):
-    """Write a mesh instead of another one; with a modifier as a cage, otherwise as polygons with normals."""
-    is_new = path not in export.places
-    if is_new:
-        # A skeleton's weights and others are of other vertices.
-        export.stage.RemovePrim(path)
-        export.places[path] = None
+    """Write a mesh; with a modifier as a cage, otherwise as polygons with normals."""
+    is_new = path not in export.written
     usd, corners = UsdGeom.Mesh.Define(export.stage, path), _values(mesh.loops, "vertex_index", np.int32)
     if is_new:
-        _bind(export, usd.GetPrim(), _values(mesh.polygons, "material_index", np.int32), slots)
+        export.written[path] = None
+        _bind(export, usd, _values(mesh.polygons, "material_index", np.int32), slots)
+        usd.GetPrim().CreateAttribute(OBJECT_NAME, KINDS.String).Set(name)
     used, index = np.unique(corners, return_inverse=True)
-    if len(used) < len(mesh.vertices):
-        warn(f'object "{name}": vertices without faces are left out ({len(mesh.vertices) - len(used)})')
     points = _values(mesh.vertices, "co", width=3)[used]
     usd.CreateDoubleSidedAttr(True)
     usd.CreateSubdivisionSchemeAttr("catmullClark" if modifier else "none")
-    values = {
-        usd.CreatePointsAttr(): points,
-        usd.CreateExtentAttr(): np.stack([points.min(0), points.max(0)]),
-        usd.CreateFaceVertexCountsAttr(): _values(mesh.polygons, "loop_total", np.int32),
-        usd.CreateFaceVertexIndicesAttr(): index.astype(np.int32),
-    }
+    values = {usd.CreatePointsAttr(): points, usd.CreateExtentAttr(): np.stack([points.min(0), points.max(0)])}
+    values[usd.CreateFaceVertexCountsAttr()] = _values(mesh.polygons, "loop_total", np.int32)
+    values[usd.CreateFaceVertexIndicesAttr()] = index.astype(np.int32)
     if modifier:
         usd.CreateInterpolateBoundaryAttr(BOUNDARY[modifier.boundary_smooth])
         usd.CreateFaceVaryingLinearInterpolationAttr(FACE_VARYING[modifier.uv_smooth])
         edges, sharpness, vertices, vertex_sharpness = _creases(mesh, used, modifier.use_creases)
-        values[usd.CreateCreaseIndicesAttr()] = edges.ravel()
+        values |= {usd.CreateCreaseIndicesAttr(): edges.ravel(), usd.CreateCreaseSharpnessesAttr(): sharpness}
         values[usd.CreateCreaseLengthsAttr()] = np.full(len(edges), 2)
-        values[usd.CreateCreaseSharpnessesAttr()] = sharpness
-        values[usd.CreateCornerIndicesAttr()], values[usd.CreateCornerSharpnessesAttr()] = vertices, vertex_sharpness
+        values |= {usd.CreateCornerIndicesAttr(): vertices, usd.CreateCornerSharpnessesAttr(): vertex_sharpness}
     else:
         values[usd.CreateNormalsAttr()] = _values(mesh.corner_normals, "vector", width=3)
         usd.SetNormalsInterpolation("faceVarying")
@@ -225,7 +191,7 @@ def write_mesh(export, path, mesh, slots, name, modifier=None):
         primvar = primvars.CreatePrimvar(Tf.MakeValidIdentifier(layer.name), kind, interpolation)
         values[primvar.GetAttr()] = colors[used] if is_vertex else colors
     for attribute, value in values.items():
-        export.put(attribute, _array(value))
+        export.put(attribute, value)
 
 
 def _values(items, name, kind=np.float32, width=1):
@@ -234,19 +200,22 @@ def _values(items, name, kind=np.float32, width=1):
     return values.reshape(-1, width) if width > 1 else values
 
 
-def _bind(export, prim, faces, slots):
+def _bind(export, usd, faces, slots):
     # A face whose slot is missing has the last one, as in Blender.
     faces = np.minimum(faces, max(len(slots) - 1, 0))
-    used = np.unique(faces) if slots else ()
+    used, api = np.unique(faces) if slots else (), UsdShade.MaterialBindingAPI.Apply(usd.GetPrim())
+    usd.CreateDisplayColorAttr([GREY])
     for slot in (slot for slot in used if slots[slot]):
-        name, target, api = slots[slot].name, prim, UsdShade.MaterialBindingAPI.Apply(prim)
-        if name not in export.materials:
-            warn(f'material "{name}" is left out, as no slot of an object has it')
-            continue
+        name, target, these = slots[slot].name, api, np.flatnonzero(faces == slot).astype(np.int32)
         if len(used) > 1:
-            child = f"{Tf.MakeValidIdentifier(name)}_{slot}"
-            target = api.CreateMaterialBindSubset(child, _array(np.flatnonzero(faces == slot))).GetPrim()
-        UsdShade.MaterialBindingAPI.Apply(target).Bind(export.materials[name])
+            subset = api.CreateMaterialBindSubset(
+                f"{Tf.MakeValidIdentifier(name)}_{slot}", Vt.IntArray.FromNumpy(these)
+            )
+            target = UsdShade.MaterialBindingAPI.Apply(subset.GetPrim())
+        if name in export.materials:
+            target.Bind(export.materials[name])
+        elif export.materials:
+            warn(f'material "{name}" is left out, as no slot of an object has it')
 
 
 def _creases(mesh, used, use_creases):
@@ -270,170 +239,122 @@ def _creases(mesh, used, use_creases):
     return np.searchsorted(used, edges[creased]), sharpness[creased], sharp, corners[sharp]
 
 
-# Mends of what a render shows
+def meshes(export):
+    """Meshes are subdivided with modifiers below the subdivision; creases that are off; smooth corners of two edges.
+
+    Instances are subdivided, to be subdivided again; those of geometry nodes have the geometry of their owner. Bevelled
+    curves are curves, and surfaces of splines are missing.
+    """
+    if not export.written:
+        geometry = [prim for prim in Usd.PrimRange(export.root) if prim.IsA(UsdGeom.Gprim)]
+        for prim in geometry + export.others[::-1]:
+            if prim in geometry or not prim.GetChildren():
+                export.stage.RemovePrim(prim.GetPath())
+    smooth, places, names, numbers = {}, [], {}, {}
+    for each in export.depsgraph.object_instances:
+        if not (each.show_self and each.object.type == "MESH" and each.object.data.polygons):
+            continue
+        thing, parent, data = each.object.original, (each.parent or each.object).original, each.object.data
+        owner = export.own.get(parent.name, export.root if thing.type == "SURFACE" else None)
+        frame = mathutils.Matrix() if owner == export.root else (each.parent or each.object).matrix_world
+        if owner is None or frame.determinant() == 0:
+            continue
+        # An object that instances itself has further meshes by geometry nodes, or its own, as curves have.
+        is_own = each.is_instance and thing == parent
+        key = thing.name, each.is_instance, is_own and data.as_pointer()
+        if key not in names:
+            number = sum(name == thing.name for name, *_ in names)
+            path = export.root.GetPath().AppendChild(f"_class_{Tf.MakeValidIdentifier(thing.name)}_{number}")
+            names[key] = export.stage.CreateClassPrim(path).GetPath() if each.is_instance else owner.GetPath()
+            path = names[key].AppendChild("Mesh")
+            if subdivision_of(thing) and not (is_own and thing.type == "MESH"):
+                smooth[path] = thing
+            else:
+                slots = [*data.materials] if is_own else [slot.material for slot in each.object.material_slots]
+                write_mesh(export, path, data, slots, thing.name)
+        if each.is_instance:
+            places.append((owner.GetPath(), names[key], frame.inverted() @ each.matrix_world))
+    # Now that all are seen, as cages change the evaluated scene.
+    for path, thing in smooth.items():
+        write_cage(export, path, thing)
+    for owner, path, matrix in places:
+        number = numbers[owner, path] = numbers.get((owner, path), -1) + 1
+        place = UsdGeom.Xform.Define(export.stage, owner.AppendChild(f"{path.name.removeprefix('_class_')}_{number}"))
+        place.GetPrim().GetInherits().SetInherits([path])
+        place.GetPrim().SetInstanceable(True)
+        export.written[place.GetPath()] = export.time
+        export.put_matrix(place, matrix)
+    for path in [path for path, time in export.written.items() if time is not None and export.is_animated]:
+        # Particles are born and die.
+        visibility = UsdGeom.Imageable.Get(export.stage, path).CreateVisibilityAttr()
+        export.put(visibility, "inherited" if export.written[path] == export.time else "invisible")
 
 
 def told(export):
     """Much is left out without a word."""
     if export.depsgraph.mode != "RENDER":
         warn("levels are those of the viewport; choose Render among the options of the export")
-    for each in export.depsgraph.object_instances:
-        thing, rays = each.object, ("camera", "diffuse", "glossy", "transmission", "shadow")
-        if thing.type in ("CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"):
-            warn(f'object "{thing.name}" is left out: {thing.type.lower()}')
-        if any(each.settings.type == "HAIR" and each.settings.render_type == "PATH" for each in thing.particle_systems):
-            warn(f'object "{thing.name}": hair of its particle systems is left out')
-        special = [f"invisible to {ray} rays" for ray in rays if not getattr(thing, f"visible_{ray}")]
-        special += ["holdout"] * thing.is_holdout + ["shadow catcher"] * thing.is_shadow_catcher
-        if special and thing.type == "MESH":
-            warn(f'object "{thing.name}" is like others in the file, but here {", ".join(special)}')
-
-
-def shown(export):
-    """Instances have the geometry of their owner, or one that is subdivided already; bevelled curves are curves."""
-    for prim in export.others[::-1]:
-        parts = [*Usd.PrimRange(prim)] if prim else []
-        has_light = any(each.HasAPI(UsdLux.LightAPI) for each in parts)
-        for each in [each for each in parts if each.IsA(UsdGeom.Gprim)] if has_light else parts[:1]:
-            export.stage.RemovePrim(each.GetPath())
-    names = {
-        each.object.name
-        for each in export.depsgraph.object_instances
-        if each.show_self and (not each.is_instance or each.parent == each.object)
-    }
-    for thing, prim in export.objects(None):
-        path = _child(prim, UsdGeom.Gprim, "Mesh")
-        if export.stage.GetPrimAtPath(path) and (thing.name not in names or not _is_mesh(thing)):
-            export.stage.RemovePrim(path)
-
-
-def _is_mesh(thing):
-    """Whether Blender's exporter writes the mesh of an object itself."""
-    return thing.type in ("MESH", "META") or (thing.type == "FONT" and not subdivision_of(thing))
-
-
-def cages(export):
-    """Meshes are subdivided where modifiers are below; unused creases, and smooth corners of two edges."""
-    for thing, prim in export.objects("MESH"):
-        path = _child(prim, UsdGeom.Mesh, "Mesh")
-        if export.stage.GetPrimAtPath(path) and subdivision_of(thing):
-            write_cage(export, path, thing)
-
-
-def instances(export):
-    """No instances, as those of collections, particles and geometry nodes; no meshes of curves and surfaces."""
-    places, smooth, classes, numbers = [], {}, {}, {}
-    for each in export.depsgraph.object_instances:
-        if not (each.is_instance and each.show_self and each.object.type == "MESH" and each.object.data.polygons):
-            continue
-        thing, parent, data = each.object.original, each.parent.original, each.object.data
-        owner = export.own.get(parent.name, export.root if thing.type == "SURFACE" else None)
-        # An object that instances itself has further meshes by geometry nodes, or its own, as curves have.
-        is_own = thing == parent
-        if owner is None or (is_own and thing.type != "MESH" and _is_mesh(thing)):
-            continue
-        key = thing.name, is_own and data.as_pointer()
-        if key not in classes:
-            number = numbers[thing.name] = numbers.get(thing.name, -1) + 1
-            classes[key] = export.root.GetPath().AppendChild(f"_class_{Tf.MakeValidIdentifier(thing.name)}_{number}")
-            export.stage.CreateClassPrim(classes[key])
-            if subdivision_of(thing) and not (is_own and thing.type == "MESH"):
-                smooth[classes[key]] = thing
-            else:
-                write_mesh(export, classes[key].AppendChild("Mesh"), data, [*data.materials], thing.name)
-        frame = mathutils.Matrix() if owner == export.root else each.parent.matrix_world
-        if frame.determinant() != 0:
-            places.append((owner.GetPath(), classes[key], thing.name, frame.inverted() @ each.matrix_world))
-    # Now that all are seen, as cages change the evaluated scene.
-    for path, thing in smooth.items():
-        write_cage(export, path.AppendChild("Mesh"), thing)
-    numbers.clear()
-    for owner, path, name, matrix in places:
-        number = numbers[owner, path] = numbers.get((owner, path), -1) + 1
-        place = UsdGeom.Xform.Define(export.stage, owner.AppendChild(f"{path.name.removeprefix('_class_')}_{number}"))
-        if place.GetPath() not in export.places:
-            place.GetPrim().GetInherits().AddInherit(path)
-            place.GetPrim().SetInstanceable(True)
-            place.GetPrim().CreateAttribute(OBJECT_NAME, KINDS.String).Set(name)
-        export.places[place.GetPath()] = export.time
-        export.put_matrix(place, matrix)
-    for path in [path for path, time in export.places.items() if time is not None and export.is_animated]:
-        # Particles are born and die.
-        visibility = UsdGeom.Imageable.Get(export.stage, path).CreateVisibilityAttr()
-        export.put(visibility, "inherited" if export.places[path] == export.time else "invisible")
-
-
-def meshes(export):
-    """Faces without a material are of no colour; colour attributes have four components, as no colour of MaterialX."""
-    for prim in (prim for prim in export.stage.TraverseAll() if prim.IsA(UsdGeom.Mesh)):
-        if not UsdShade.MaterialBindingAPI(prim).GetDirectBinding().GetMaterial():
-            UsdGeom.Gprim(prim).CreateDisplayColorAttr([GREY])
-        for old in UsdGeom.PrimvarsAPI(prim).GetPrimvars():
-            if old.GetTypeName() == KINDS.Color4fArray:
-                colors, interpolation = np.array(old.Get(Usd.TimeCode.EarliestTime()))[:, :3], old.GetInterpolation()
-                prim.RemoveProperty(old.GetName())
-                new = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(old.GetName(), KINDS.Color3fArray, interpolation)
-                new.Set(_array(colors))
-
-
-# Mends of cameras, lights and film
+    for thing in (each.object for each in export.depsgraph.object_instances):
+        rays = ("camera", "diffuse", "glossy", "transmission", "shadow") if thing.type == "MESH" else ()
+        left = [f"rays to which it is invisible ({ray})" for ray in rays if not getattr(thing, f"visible_{ray}")]
+        left += ["holdout"] * thing.is_holdout + ["shadow catcher"] * (thing.is_shadow_catcher and bool(rays))
+        left += [thing.type.lower()] * (thing.type in ("CURVES", "POINTCLOUD", "VOLUME", "GREASEPENCIL"))
+        left += ["panorama"] * (thing.type == "CAMERA" and thing.data.type == "PANO")
+        kinds = [(system.settings.type, system.settings.render_type) for system in thing.particle_systems]
+        left += ["hair"] * (("HAIR", "PATH") in kinds)
+        if left:
+            warn(f'object "{thing.name}": left out: {", ".join(left)}')
 
 
 def cameras(export):
     """Orthographic cameras are missing, and shutters."""
     render = export.scene.render
     aspect = render.resolution_x * render.pixel_aspect_x / (render.resolution_y * render.pixel_aspect_y)
-    for thing, prim in export.objects("CAMERA"):
-        data, values = thing.evaluated_get(export.depsgraph).data, {}
-        if data.type == "PANO":
-            warn(f'camera "{thing.name}" is panoramic and left out')
+    for thing, prim in [(bpy.data.objects[name], prim) for name, prim in export.own.items()]:
+        if thing.type != "CAMERA" or thing.data.type == "PANO":
             continue
+        data, values = thing.evaluated_get(export.depsgraph).data, {}
         camera = UsdGeom.Camera.Define(export.stage, _child(prim, UsdGeom.Camera, "Camera"))
         if data.type == "ORTHO":
             camera.CreateProjectionAttr("orthographic")
             size = 10 * data.ortho_scale  # In tenths of a unit.
             fits_height = data.sensor_fit == "VERTICAL" or (data.sensor_fit == "AUTO" and aspect < 1)
-            values["horizontalAperture"] = size * aspect if fits_height else size
-            values["verticalAperture"] = size if fits_height else size / aspect
+            width = size * aspect if fits_height else size
+            values = {"horizontalAperture": width, "verticalAperture": width / aspect}
             values |= {"horizontalApertureOffset": data.shift_x * size, "verticalApertureOffset": data.shift_y * size}
             values["clippingRange"] = Gf.Vec2f(data.clip_start, data.clip_end)
         if render.use_motion_blur and export.is_animated:
-            values["shutter:open"] = SHUTTERS[render.motion_blur_position] * render.motion_blur_shutter
-            values["shutter:close"] = values["shutter:open"] + render.motion_blur_shutter
-        for name, value in values.items():
-            export.put(camera.GetPrim().GetAttribute(name), value)
+            start = {"START": 0.0, "CENTER": -0.5, "END": -1.0}[render.motion_blur_position]
+            length = render.motion_blur_shutter
+            values |= {"shutter:open": start * length, "shutter:close": (start + 1) * length}
+        for each, value in values.items():
+            export.put(camera.GetPrim().GetAttribute(each), value)
 
 
 def lights(export):
     """A quarter of the sun's energy, a tint of 6500 K, softer cones, disks for ellipses, radii that are scaled."""
-    for prim in [prim for prim in export.stage.Traverse() if prim.HasAPI(UsdLux.LightAPI)]:
-        thing = _object_of(prim.GetParent())
-        if not thing or thing.type != "LIGHT":
-            continue
-        thing = thing.evaluated_get(export.depsgraph)
-        light, api, left = thing.data, UsdLux.LightAPI(prim), []
+    prims = [prim for prim in export.stage.Traverse() if prim.HasAPI(UsdLux.LightAPI) and _object_of(prim.GetParent())]
+    for prim in prims:
+        thing = _object_of(prim.GetParent()).evaluated_get(export.depsgraph)
+        light, left = thing.data, []
         # USD's intensity is radiance times area, but irradiance of the sun.
         intensity, color = light.energy / (1 if light.type == "SUN" else math.pi), mathutils.Vector(light.color)
-        if not getattr(light, "normalize", True):
-            intensity *= light.area(matrix_world=thing.matrix_world)
-        if getattr(light, "use_temperature", False):
-            color *= mathutils.Vector(light.temperature_color)
-        node = surface_node(light) if light.use_nodes else None
-        if node and node.type == "EMISSION" and not any(each.is_linked for each in node.inputs):
+        intensity *= 1 if light.normalize else light.area(matrix_world=thing.matrix_world)
+        color *= mathutils.Vector(light.temperature_color if light.use_temperature else (1, 1, 1))
+        node = _surface_node(light) if light.use_nodes else None
+        if node and (node.type != "EMISSION" or any(each.is_linked for each in node.inputs)):
+            left.append("its nodes")
+        elif node:
             intensity *= node.inputs["Strength"].default_value
             color *= mathutils.Vector(node.inputs["Color"].default_value[:3])
-        elif node:
-            left.append("its nodes")
-        values = {"color": Gf.Vec3f(*color), "intensity": intensity, "exposure": getattr(light, "exposure", 0.0)}
+        values = {"color": Gf.Vec3f(*color), "intensity": intensity, "exposure": light.exposure}
+        values |= {"normalize": True, "enableColorTemperature": False}
         # Lights other than areas are not scaled with their objects.
         shape = thing.matrix_world.inverted_safe() @ thing.matrix_world.normalized()
-        if light.type == "SUN":
-            values["angle"] = math.degrees(light.angle)
-        elif light.type == "AREA":
+        if light.type == "AREA":
             shape = mathutils.Matrix.Diagonal((1, light.size_y / light.size if light.shape == "ELLIPSE" else 1, 1, 1))
-            left += ["its spread"] * (light.spread < math.pi - ROUNDING) + [
-                "that it is a portal"
-            ] * light.cycles.is_portal
+            left += ["its spread"] * (light.spread < math.pi - ROUNDING)
+            left += ["that it is a portal"] * light.cycles.is_portal
         elif light.type == "SPOT":
             # Blender blends by cosines, USD by angles; both ends are the same.
             half, edge = light.spot_size / 2, math.cos(light.spot_size / 2)
@@ -445,89 +366,73 @@ def lights(export):
             warn(f'light "{thing.name}": left out: {", ".join(left)}')
         for name, value in values.items():
             export.put(prim.GetAttribute(f"inputs:{name}"), value)
-        api.GetEnableColorTemperatureAttr().Clear()
-        api.CreateNormalizeAttr(True)
         if np.abs(np.array(shape) - np.eye(4)).max() > ROUNDING:
             export.put_matrix(prim, shape)
 
 
 def world(export):
     """An image lies on its side and lacks its strength; a colour is an image, too."""
-    source, stage, path = export.scene.world, export.stage, _child(export.root, UsdLux.DomeLight, "env_light")
-    if not source:
-        return
-    color, strength, node, texture, turn = tuple(source.color), 1.0, surface_node(source), None, None
-    if node:
-        found = origin(node.inputs["Color"]) if node.type == "BACKGROUND" else None
-        if found and found[0].type == "TEX_ENVIRONMENT":
-            texture, turn = found[0], _environment_turn(found[0])
-        if node.type != "BACKGROUND" or node.inputs["Strength"].is_linked or (found and not turn):
-            warn(f'world "{source.name}" is more than a colour or an image and left out')
-            stage.RemovePrim(path)
+    source, path = export.scene.world, _child(export.root, UsdLux.DomeLight, "env_light")
+    node = _surface_node(source) if source else None
+    found = _origin(node.inputs["Color"]) if node and node.type == "BACKGROUND" else None
+    texture = found[0] if found and found[0].type == "TEX_ENVIRONMENT" else None
+    turn = _environment_turn(texture) if texture else None
+    if node and (node.type != "BACKGROUND" or node.inputs["Strength"].is_linked or (found and not turn)):
+        warn(f'world "{source.name}" is more than a colour or an image and left out')
+        export.stage.RemovePrim(path)
+    elif source:
+        color = Gf.Vec3f(*(1, 1, 1) if texture else node.inputs["Color"].default_value[:3] if node else source.color)
+        dome = UsdLux.DomeLight.Define(export.stage, path)
+        export.put(dome.CreateIntensityAttr(), node.inputs["Strength"].default_value if node else 1.0)
+        export.put(dome.CreateColorAttr(), color)
+        if not texture:
+            dome.GetPrim().RemoveProperty("inputs:texture:file")
             return
-        color, strength = tuple(node.inputs["Color"].default_value)[:3], node.inputs["Strength"].default_value
-    dome = UsdLux.DomeLight.Define(stage, path)
-    export.put(dome.CreateIntensityAttr(), strength)
-    export.put(dome.CreateColorAttr(), Gf.Vec3f(1) if texture else Gf.Vec3f(*color))
-    if not texture:
-        dome.GetPrim().RemoveProperty("inputs:texture:file")
-        return
-    dome.CreateTextureFormatAttr("latlong")
-    dome.SetXformOpOrder([])
-    export.put_matrix(dome, (turn @ DOME).to_4x4())
-    if (texture.image.colorspace_settings.name == "sRGB") == texture.image.is_float:
-        warn(f'world "{source.name}": its image is taken as sRGB if it has eight bits, and else as linear')
+        dome.SetXformOpOrder([])
+        export.put_matrix(dome, (turn @ DOME).to_4x4())
+        if (texture.image.colorspace_settings.name == "sRGB") == texture.image.is_float:
+            warn(f'world "{source.name}": its image is taken as sRGB if it has eight bits, and else as linear')
 
 
 def _environment_turn(node):
     """Rotation of an environment image; None if its coordinates are others than turned directions."""
-    source, turn = origin(node.inputs["Vector"]), mathutils.Matrix.Identity(3)
-    if source and source[0].type == "MAPPING":
-        place, rotation, scale = (source[0].inputs.get(name) for name in ("Location", "Rotation", "Scale"))
-        is_turn = place and not any(place.default_value) and tuple(scale.default_value) == (1, 1, 1)
-        if not is_turn or source[0].vector_type != "POINT" or any(each.is_linked for each in (place, rotation, scale)):
+    source, turn = _origin(node.inputs["Vector"]), mathutils.Matrix.Identity(3)
+    if source and source[0].type == "MAPPING" and source[0].vector_type == "POINT":
+        _, place, rotation, scale = source[0].inputs
+        if any(place.default_value) or tuple(scale.default_value) != (1, 1, 1) or rotation.is_linked:
             return None
-        turn, source = rotation.default_value.to_matrix().inverted(), origin(source[0].inputs["Vector"])
+        turn, source = rotation.default_value.to_matrix().inverted(), _origin(source[0].inputs["Vector"])
     is_direction = not source or (source[0].type == "TEX_COORD" and source[1].name == "Generated")
     return turn if is_direction and node.projection == "EQUIRECTANGULAR" and node.image else None
 
 
 def film(export):
     """The stage has no render settings."""
-    scene, render, settings = (
-        export.scene,
-        export.scene.render,
-        UsdRender.Settings.Define(export.stage, "/Render/Settings"),
-    )
-    export.stage.SetMetadata("renderSettingsPrimPath", "/Render/Settings")
-    size = [max(1, side * render.resolution_percentage // 100) for side in (render.resolution_x, render.resolution_y)]
+    scene, render, stage = export.scene, export.scene.render, export.stage
+    settings = UsdRender.Settings.Define(stage, "/Render/Settings")
+    stage.SetMetadata("renderSettingsPrimPath", "/Render/Settings")
+    size = (max(1, side * render.resolution_percentage // 100) for side in (render.resolution_x, render.resolution_y))
     settings.CreateResolutionAttr(Gf.Vec2i(*size))
     settings.CreatePixelAspectRatioAttr(render.pixel_aspect_x / render.pixel_aspect_y)
     if render.use_border:
-        window = render.border_min_x, render.border_min_y, render.border_max_x, render.border_max_y
-        settings.CreateDataWindowNDCAttr(Gf.Vec4f(*window))
+        sides = (getattr(render, f"border_{side}") for side in ("min_x", "min_y", "max_x", "max_y"))
+        settings.CreateDataWindowNDCAttr(Gf.Vec4f(*sides))
     settings.GetPrim().CreateAttribute("cycles:background:transparent", KINDS.Bool).Set(render.film_transparent)
     settings.GetPrim().CreateAttribute("cycles:samples", KINDS.Int).Set(scene.cycles.samples)
-    owner = scene.camera and export.own.get(scene.camera.name)
-    if owner and scene.camera.data.type != "PANO":
-        camera = UsdGeom.Camera.Define(export.stage, _child(owner, UsdGeom.Camera, "Camera"))
-        settings.CreateCameraRel().SetTargets([camera.GetPath()])
-        if scene.cycles.film_exposure != 1:
-            camera.CreateExposureAttr(math.log2(scene.cycles.film_exposure))
+    if scene.cycles.film_exposure != 1:
+        warn(f"the exposure of the film, {scene.cycles.film_exposure:g}, is left out")
+    if scene.camera and scene.camera.name in export.own:
+        path = _child(export.own[scene.camera.name], UsdGeom.Camera, "Camera")
+        settings.CreateCameraRel().SetTargets([path])
 
 
-# Mends of materials
-
-
-def surface_node(owner):
-    """The node at the output of a material, a light or a world; None if there is none."""
+def _surface_node(owner):
     output = owner.node_tree.get_output_node("ALL") if owner.node_tree else None
-    source = origin(output.inputs["Surface"]) if output else None
+    source = _origin(output.inputs["Surface"]) if output else None
     return source and source[0]
 
 
-def origin(socket):
-    """The node and its output that an input is linked to, through reroutes; None if there is none."""
+def _origin(socket):
     while socket.links and socket.links[0].from_node.type == "REROUTE":
         socket = socket.links[0].from_node.inputs[0]
     return (socket.links[0].from_node, socket.links[0].from_socket) if socket.links else None
@@ -539,34 +444,33 @@ def materials(export):
         source, surface = bpy.data.materials.get(name), material.ComputeSurfaceSource("mtlx")[0]
         if not surface:
             warn("materials have no networks of MaterialX; choose MaterialX Network among the options of the export")
-        node = surface_node(source) if source and surface else None
+        node = _surface_node(source) if source and surface else None
         if not node:
             continue
         if surface.GetShaderId() == "ND_surface":
-            surface = _other_surface(material, surface, node)
+            _mend_other(material, surface, node)
         if node.type == "BSDF_PRINCIPLED":
             _mend_principled(name, node, surface)
         for each in source.node_tree.nodes:
             if each.type in ATTRIBUTES:
                 _connect_attribute(name, each, material, surface)
             if each.type == "MIX" and each.data_type == "RGBA" and each.blend_type != "MIX":
-                _blend(name, each, _mixture(material, each))
+                _blend(material, each, _shader(material, each))
 
 
-def _other_surface(material, surface, node):
-    made = _shader(material, material.GetPath().AppendChild("Surface"), "open_pbr_surface_surfaceshader")
-    material.CreateSurfaceOutput("mtlx").ConnectToSource(made.CreateOutput("surface", KINDS.Token))
-    inputs = [each for each in (surface.GetInput("bsdf"), surface.GetInput("edf")) if each]
-    for producer in [producer for each in inputs for producer in each.GetValueProducingAttributes()]:
-        shader = UsdShade.Shader(producer.GetPrim())
-        if shader.GetShaderId() not in SURFACES:
+def _mend_other(material, surface, node):
+    surface.CreateIdAttr("ND_open_pbr_surface_surfaceshader")
+    for given in [given for given in surface.GetInputs() if given.HasConnectedSource()]:
+        shader = UsdShade.Shader(given.GetValueProducingAttributes()[0].GetPrim())
+        name, values = SURFACES.get(shader.GetShaderId(), (None, {}))
+        if name:
+            _copy_input(shader.GetInput("color"), surface, name)
+        else:
             warn(f'material "{material.GetPrim().GetName()}": the {node.bl_label} is left out')
-            continue
-        name, values = SURFACES[shader.GetShaderId()]
-        _copy_input(shader.GetInput("color"), made, name)
         for name, value in values.items():
-            made.CreateInput(name, KINDS.Float).Set(value)
-    return made
+            surface.CreateInput(name, KINDS.Float).Set(value)
+    for end in ("bsdf", "edf", "opacity", "thin_walled"):
+        surface.GetPrim().RemoveProperty(f"inputs:{end}")
 
 
 def _mend_principled(name, node, surface):
@@ -577,9 +481,12 @@ def _mend_principled(name, node, surface):
     if node.inputs["Metallic"].is_linked or node.inputs["Metallic"].default_value > 0:
         surface.CreateInput("specular_weight", KINDS.Float).Set(1.0)
     for label, key in INPUTS.items():
-        found, given = origin(node.inputs[label]), surface.GetInput(key)
-        is_kept = given and given.HasConnectedSource()
-        if found and not is_kept and found[0].type not in ATTRIBUTES + CONSTANT:
+        found, given = _origin(node.inputs[label]), surface.GetInput(key)
+        if (
+            found
+            and not (given and given.HasConnectedSource())
+            and found[0].type not in (*ATTRIBUTES, "RGB", "VALUE", "MIX")
+        ):
             warn(f'material "{name}": the {found[0].bl_label} at "{label}" is left out')
 
 
@@ -587,39 +494,36 @@ def _connect_attribute(material_name, node, material, surface):
     name = node.layer_name if node.type == "VERTEX_COLOR" else node.attribute_name
     for link in node.outputs["Color"].links:
         is_principled = link.to_node.type == "BSDF_PRINCIPLED"
-        shader = surface if is_principled else _mixture(material, link.to_node)
+        shader = surface if is_principled else _shader(material, link.to_node)
         key = (INPUTS if is_principled else {"A": "bg", "B": "fg"}).get(link.to_socket.name)
-        if not shader or not key:
+        if shader and key:
+            made = _shader(material, node, "geompropvalue_color3")
+            made.CreateInput("geomprop", KINDS.String).Set(Tf.MakeValidIdentifier(name))
+            shader.CreateInput(key, KINDS.Color3f).ConnectToSource(made.CreateOutput("out", KINDS.Color3f))
+        else:
             warn(f'material "{material_name}": the attribute "{name}" at "{link.to_socket.name}" is left out')
-            continue
-        path = material.GetPath().AppendChild(f"Attribute_{Tf.MakeValidIdentifier(name)}")
-        made = _shader(material, path, "geompropvalue_color3")
-        made.CreateInput("geomprop", KINDS.String).Set(Tf.MakeValidIdentifier(name))
-        shader.CreateInput(key, KINDS.Color3f).ConnectToSource(made.CreateOutput("out", KINDS.Color3f))
 
 
-def _blend(name, node, shader):
+def _blend(material, node, shader):
     if shader and node.blend_type in BLENDS:
         shader.CreateIdAttr(f"ND_{BLENDS[node.blend_type]}_color3")
     elif shader and node.blend_type == "MULTIPLY":
         # The foreground of a mixture is the product.
-        path = shader.GetPath().ReplaceName(f"{shader.GetPrim().GetName()}_product")
-        product = _shader(shader, path, "multiply_color3")
+        product = _shader(material, node, "multiply_color3")
         _copy_input(shader.GetInput("bg"), product, "in1")
         _copy_input(shader.GetInput("fg"), product, "in2")
         shader.GetInput("fg").ConnectToSource(product.CreateOutput("out", KINDS.Color3f))
     elif shader:
-        warn(f'material "{name}": the blend {node.blend_type.lower()} of "{node.name}" is a mixture')
+        warn(f'material "{material.GetPrim().GetName()}": the {node.blend_type.lower()} of "{node.name}" is a mixture')
 
 
-def _mixture(material, node):
-    path = material.GetPath().AppendPath(f"NodeGraphs/bnode__{Tf.MakeValidIdentifier(node.name)}_Result_Color")
-    return UsdShade.Shader.Get(material.GetPrim().GetStage(), path)
-
-
-def _shader(schema, path, name):
-    made = UsdShade.Shader.Define(schema.GetPrim().GetStage(), path)
-    made.CreateIdAttr(f"ND_{name}")
+def _shader(material, node, output="Result_Color"):
+    """Shader of the colour that a node mixes, or a new one by a definition of MaterialX."""
+    path = material.GetPath().AppendPath(f"NodeGraphs/bnode__{Tf.MakeValidIdentifier(node.name)}_{output}")
+    if output == "Result_Color":
+        return UsdShade.Shader.Get(material.GetPrim().GetStage(), path)
+    made = UsdShade.Shader.Define(material.GetPrim().GetStage(), path)
+    made.CreateIdAttr(f"ND_{output}")
     return made
 
 
@@ -628,10 +532,6 @@ def _copy_input(given, shader, name):
     made.GetAttr().SetConnections(given.GetAttr().GetConnections())
     if given.Get() is not None:
         made.Set(given.Get())
-
-
-MENDS = (told, shown, materials, film)
-MENDS_OF_FRAMES = (cages, instances, cameras, lights, world)
 
 
 class CageHook(bpy.types.USDHook):
@@ -649,72 +549,29 @@ class CageHook(bpy.types.USDHook):
         return True
 
 
-def register():
-    """Mend what File > Export writes."""
-    bpy.utils.register_class(CageHook)
+MENDS, MENDS_OF_FRAMES = (told, materials, film), (meshes, cameras, lights, world)
+register, unregister = bpy.utils.register_classes_factory((CageHook,))
 
 
-def unregister():
-    """Leave what File > Export writes."""
-    bpy.utils.unregister_class(CageHook)
-
-
-# The command
-
-
-def _meshes_of(stage, name):
-    """Name of its object and mesh of each mesh of an object, or of all."""
-    found = []
-    for prim in Usd.PrimRange(stage.GetDefaultPrim(), Usd.TraverseInstanceProxies()):
-        owner = prim
-        while owner and not owner.HasAttribute(OBJECT_NAME):
-            owner = owner.GetParent()
-        if owner and prim.IsA(UsdGeom.Mesh):
-            found.append((owner.GetAttribute(OBJECT_NAME).Get(), UsdGeom.Mesh(prim)))
-    names = ", ".join(f'"{each}"' for each in sorted({each for each, _ in found}))
-    if not found:
-        raise ExportError("the scene has no meshes that a render shows; expected one")
-    if name not in (None, *(each for each, _ in found)):
-        raise ExportError(f'a render shows no mesh of the object "{name}"; expected one of {names}')
-    return found
-
-
-def _is_cage(mesh):
-    return mesh.GetSubdivisionSchemeAttr().Get() == "catmullClark"
-
-
-def obj_text(found, wanted):
-    """One cage in world space, with OpenSubdiv's tags."""
-    smooth = [(name, mesh) for name, mesh in found if _is_cage(mesh)]
-    names, chosen = (
-        ", ".join(f'"{name}"' for name, _ in smooth),
-        [mesh for name, mesh in smooth if wanted in (None, name)],
-    )
-    if not smooth:
-        raise ExportError("no object has a subdivision modifier of the type Catmull-Clark; expected one")
-    if len(chosen) != 1 and wanted is None:
-        raise ExportError(f"OBJ files hold one cage, but there are {len(smooth)}; choose with --object: {names}")
-    if len(chosen) != 1:
-        raise ExportError(f'there are {len(chosen)} cages of the object "{wanted}"; expected one, as of {names}')
-    if len(found) > 1:
-        warn(f"OBJ files hold one cage: {len(found) - 1} other meshes are left out")
-    mesh, matrix = chosen[0], np.array(UsdGeom.XformCache().GetLocalToWorldTransform(chosen[0].GetPrim()))
+def obj_text(mesh):
+    """A cage in world space, with OpenSubdiv's tags."""
+    matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(mesh.GetPrim()))
     points = np.array(mesh.GetPointsAttr().Get(), float) @ matrix[:3, :3] + matrix[3, :3]
     corners, ends = np.array(mesh.GetFaceVertexIndicesAttr().Get()), np.cumsum(mesh.GetFaceVertexCountsAttr().Get())
+    starts, uvs = np.append(0, ends[:-1]), UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get()
     lines, texts = [f"v {x!r} {y!r} {z!r}" for x, y, z in points.tolist()], [f"{vertex + 1}" for vertex in corners]
-    uvs = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get()
     if uvs:
         # Shared by corners of a vertex whose faces have the same winding in the plane of the texture, as in Blender.
         uvs, after = np.array(uvs, float), np.arange(1, len(corners) + 1)
-        after[ends - 1] = np.append(0, ends[:-1])
-        areas = np.add.reduceat(np.cross(uvs, uvs[after]), np.append(0, ends[:-1]))
-        keys = np.column_stack([corners, np.repeat(areas > 0, np.diff(ends, prepend=0)), uvs])
+        after[ends - 1] = starts
+        areas = np.add.reduceat(uvs[:, 0] * uvs[after, 1] - uvs[:, 1] * uvs[after, 0], starts)
+        keys = np.column_stack([corners, np.repeat(areas > 0, ends - starts), uvs])
         values, index = np.unique(keys, axis=0, return_inverse=True)
         lines += [f"vt {u!r} {v!r}" for u, v in values[:, 2:].tolist()]
         texts = [f"{text}/{each + 1}" for text, each in zip(texts, index.ravel(), strict=True)]
     # Faces of a mesh that its transform mirrors are turned over, so that they are counter-clockwise from outside.
     step = -1 if np.linalg.det(matrix) < 0 else 1
-    lines += ["f " + " ".join(texts[start:end][::step]) for start, end in zip([0, *ends], ends, strict=False)]
+    lines += ["f " + " ".join(texts[start:end][::step]) for start, end in zip(starts, ends, strict=True)]
     edges = np.reshape(mesh.GetCreaseIndicesAttr().Get(), (-1, 2)).astype(int).tolist()
     creased = zip(edges, mesh.GetCreaseSharpnessesAttr().Get(), strict=True)
     sharp = zip(mesh.GetCornerIndicesAttr().Get(), mesh.GetCornerSharpnessesAttr().Get(), strict=True)
@@ -737,56 +594,53 @@ def export_file(arguments):
     root, extension = os.path.splitext(os.path.abspath(options.output))
     is_obj = extension.lower() == ".obj"
     if extension.lower() not in (".usda", ".usdc", ".obj"):
-        raise ExportError(f'output "{options.output}" has the extension "{extension}"; expected .usda, .usdc or .obj')
+        sys.exit(f'export_cage: "{options.output}" ends with "{extension}"; expected .usda, .usdc or .obj')
     if not os.path.isdir(os.path.dirname(root)):
-        raise ExportError(f"{options.output}: No such file or directory")
-    if options.blend and not os.path.isfile(options.blend):
-        raise ExportError(f'"{options.blend}" is no file; expected a scene of Blender')
+        sys.exit(f"export_cage: {options.output}: No such file or directory")
     if options.blend:
         bpy.ops.wm.open_mainfile(filepath=os.path.abspath(options.blend))
     # Beside the file and renamed, so that there is never half of one.
     part = f"{root}.part{'.usda' if is_obj else extension}"
     # Instead of skeletons and blended shapes, the vertices of each frame.
     kinds = {"export_armatures": False, "export_shapekeys": False, "export_animation": options.animation}
-    looks = {"export_materials": not is_obj, "convert_world_material": not is_obj, "overwrite_textures": True}
+    kinds |= {"export_materials": not is_obj, "convert_world_material": not is_obj, "overwrite_textures": True}
+    kinds |= {"generate_materialx_network": True, "evaluation_mode": "RENDER"}
     try:
-        bpy.ops.wm.usd_export(
-            filepath=part, evaluation_mode="RENDER", generate_materialx_network=True, **kinds, **looks
-        )
+        bpy.ops.wm.usd_export(filepath=part, **kinds)
         stage = Usd.Stage.Open(part)
-        found = _meshes_of(stage, options.object)
-        count = sum(_is_cage(mesh) for name, mesh in found if options.object in (None, name))
+        prims = Usd.PrimRange(stage.GetDefaultPrim(), Usd.TraverseInstanceProxies())
+        found = [(prim.GetAttribute(OBJECT_NAME).Get(), UsdGeom.Mesh(prim)) for prim in prims if prim.IsA(UsdGeom.Mesh)]
+        cages = [(name, mesh) for name, mesh in found if mesh.GetSubdivisionSchemeAttr().Get() != "none"]
+        expected = cages if is_obj else found
+        chosen = [mesh for name, mesh in expected if options.object in (None, name)]
+        if not chosen or (is_obj and len(chosen) > 1):
+            names = ", ".join(f'"{name}"' for name in sorted({name for name, _ in expected}))
+            what = f"{len(chosen)} {'cages' if is_obj else 'meshes'} of {options.object or 'all objects'}"
+            sys.exit(f"export_cage: a render shows {what}; choose one with --object: {names}")
         if is_obj:
-            text = obj_text(found, options.object)
+            warn(f"OBJ files hold one cage; other meshes that are left out: {len(found) - 1}")
+            text = obj_text(chosen[0])
             with open(part, "w", encoding="utf-8", newline="\n") as file:
                 file.write(text)
         elif options.object:
             # Instances are left out as a whole.
             prims = [mesh.GetPrim() for name, mesh in found if name != options.object]
-            for path in [prim.GetParent().GetPath() if prim.IsInstanceProxy() else prim.GetPath() for prim in prims]:
-                stage.RemovePrim(path)
+            for prim in [prim.GetParent() if prim.IsInstanceProxy() else prim for prim in prims]:
+                stage.RemovePrim(prim.GetPath())
             stage.Save()
         os.replace(part, options.output)
     finally:
         if os.path.exists(part):
             os.remove(part)
+    count = sum(options.object in (None, name) for name, _ in cages)
     print(f"export_cage: {count} subdivision surfaces written to {options.output}", file=sys.stderr)
 
 
-def main():
-    """Export, and end the process with a status that tells whether it worked: Blender itself would end with 0."""
-    arguments = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
+if __name__ == "__main__":
     register()
     try:
-        export_file(arguments)
-    except ExportError as error:
-        sys.exit(f"export_cage: {error}")
-    except Exception:
-        traceback.print_exc()
-        sys.exit(1)
+        export_file(sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:])
+    except Exception as error:
+        sys.exit(f"export_cage: {error}")  # Blender itself would end with 0.
     finally:
         unregister()
-
-
-if __name__ == "__main__":
-    main()

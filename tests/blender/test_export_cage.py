@@ -128,16 +128,16 @@ def test_materials_lights_and_camera_are_usds(scene):
     assert not stage.GetCompositionErrors()
     assert UsdGeom.GetStageUpAxis(stage) == "Z"
     for name in ("ALL_NONE", "Würfel_1_001"):
-        mesh = UsdGeom.Imageable(stage.GetPrimAtPath(f"/root/{name}/House"))
+        mesh = UsdGeom.Imageable(stage.GetPrimAtPath(f"/root/{name}/Mesh"))
         parts = UsdGeom.Subset.GetGeomSubsets(mesh, "face", "materialBind")
         bound = {part.GetIndicesAttr().Get()[-1]: bound_color(part.GetPrim()) for part in parts}
         assert bound == {10: pytest.approx((0.9, 0.6, 0.2)), 11: pytest.approx((0.8, 0.1, 0.05))}
     # Its first slot has a material of the object.
-    parts = stage.GetPrimAtPath("/root/no_creases/House").GetChildren()
+    parts = stage.GetPrimAtPath("/root/no_creases/Mesh").GetChildren()
     assert [bound_color(part) for part in parts] == 2 * [pytest.approx((0.9, 0.6, 0.2))]
-    assert bound_color(stage.GetPrimAtPath("/root/Ground/Ground")) == pytest.approx((0.9, 0.6, 0.2))
+    assert bound_color(stage.GetPrimAtPath("/root/Ground/Mesh")) == pytest.approx((0.9, 0.6, 0.2))
     # Faces without a material are grey.
-    grey = UsdGeom.Gprim(stage.GetPrimAtPath("/root/Smooth/Smooth")).GetDisplayColorAttr().Get()
+    grey = UsdGeom.Gprim(stage.GetPrimAtPath("/root/Smooth/Mesh")).GetDisplayColorAttr().Get()
     np.testing.assert_allclose(grey, [[0.8, 0.8, 0.8]], rtol=1e-6)
     camera = UsdGeom.Camera(stage.GetPrimAtPath("/root/Camera/Camera")).GetCamera()
     # Blender's default sensor is 36 mm wide, and its picture 1920 x 1080.
@@ -155,7 +155,7 @@ def test_materials_lights_and_camera_are_usds(scene):
 def test_polygons_with_smooth_shading_have_normals(scene):
     """Those of a tetrahedron around the origin point away from it."""
     stage = Usd.Stage.Open(str(scene[1]))
-    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/root/Smooth/Smooth"))
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/root/Smooth/Mesh"))
     corners = np.array(mesh.GetPointsAttr().Get())[np.array(mesh.GetFaceVertexIndicesAttr().Get())]
     np.testing.assert_allclose(mesh.GetNormalsAttr().Get(), corners / np.sqrt(3), atol=1e-3)
     assert mesh.GetNormalsInterpolation() == "faceVarying"
@@ -185,7 +185,7 @@ def test_points_are_those_of_a_render(shown):
     found, cages, place = {}, {}, UsdGeom.XformCache(1)
     for prim in Usd.PrimRange(stage.GetDefaultPrim(), Usd.TraverseInstanceProxies()):
         if prim.IsA(UsdGeom.Mesh):
-            owner = prim.GetParent().GetAttribute("userProperties:blender:object_name").Get()
+            owner = prim.GetAttribute("userProperties:blender:object_name").Get()
             points = np.array(UsdGeom.Mesh(prim).GetPointsAttr().Get(1))
             matrix = np.array(place.GetLocalToWorldTransform(prim))
             is_cage = UsdGeom.Mesh(prim).GetSubdivisionSchemeAttr().Get() != "none"
@@ -206,7 +206,7 @@ def test_what_moves_has_samples(shown):
         return [np.array(stage.GetAttributeAtPath(f"/root/{path}").Get(time)) for time in times]
 
     # Blender eases in and out; frame 2 is half-way.
-    base, middle, larger = values("key/key.points", 1, 2, 3)
+    base, middle, larger = values("key/Mesh.points", 1, 2, 3)
     np.testing.assert_allclose([middle, larger], [1.5 * base, 2 * base], rtol=1e-6)
     np.testing.assert_allclose(values("Sun/Sun.inputs:intensity", 1, 3), [1, 3], rtol=1e-6)
     np.testing.assert_allclose(values("Camera/Camera.horizontalAperture", 1, 3), [400, 600], rtol=1e-6)
@@ -256,7 +256,7 @@ def test_what_is_left_out_is_told(look):
     told = look[2]
     for what in (
         'light "Lamp": left out: its spread',
-        'object "tile_12" is like others in the file, but here invisible to shadow rays',
+        'object "tile_12": left out: rays to which it is invisible (shadow)',
         'material "paint_12": the Glass BSDF is left out',
     ):
         assert told.count(f"export_cage: {what}") == 1, told
@@ -290,9 +290,9 @@ def test_an_obj_file_has_the_same_cage(scene, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["model.stl"], 'output "model.stl" has the extension ".stl"; expected .usda, .usdc or .obj'),
-        (["model.obj"], "OBJ files hold one cage, but there are 17; choose with --object: "),
-        (["model.usda", "--object", "hidden"], 'a render shows no mesh of the object "hidden"; expected one of "ALL_'),
+        (["model.stl"], '"model.stl" ends with ".stl"; expected .usda, .usdc or .obj'),
+        (["model.obj"], "a render shows 17 cages of all objects; choose one with --object: "),
+        (["model.usda", "--object", "hidden"], 'a render shows 0 meshes of hidden; choose one with --object: "ALL_'),
         (["no/such/folder/model.usda"], "no/such/folder/model.usda: No such file or directory"),
     ],
 )
