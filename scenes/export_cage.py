@@ -15,7 +15,7 @@ Install from Disk), this file mends what File > Export > Universal Scene Descrip
 import argparse
 import functools
 import math
-import os
+import pathlib
 import re
 import sys
 
@@ -80,7 +80,6 @@ class Export:
                 self.others.append(prim)
 
     def mend(self):
-        """Call the mends, some of them where the scene is at each frame."""
         for mend in MENDS:
             mend(self)
         before = self.scene.frame_current, self.scene.frame_subframe
@@ -96,7 +95,7 @@ class Export:
             self.scene.frame_set(before[0], subframe=before[1])
 
     def put(self, attribute, value):
-        """Author a value; it has samples from the frame on before which it moves."""
+        # It has samples from the frame on before which it moves.
         path = attribute.GetPath()
         if isinstance(value, np.ndarray):
             width, is_integer = value.shape[1] if value.ndim == 2 else 1, value.dtype.kind == "i"
@@ -114,7 +113,6 @@ class Export:
         self.values[path] = value, self.time, moves
 
     def put_matrix(self, prim, matrix):
-        """Author a transform, by Blender's matrix for column vectors."""
         place = UsdGeom.Xformable(prim)
         numbers = [number for column in matrix.transposed() for number in column]
         self.put((place.GetTransformOp() or place.AddTransformOp()).GetAttr(), Gf.Matrix4d(*numbers))
@@ -163,10 +161,8 @@ def write_mesh(export, path, mesh, slots, name, modifier=None):
         _bind(export, usd, _values(mesh.polygons, "material_index", np.int32), slots)
         usd.GetPrim().CreateAttribute(OBJECT_NAME, KINDS.String).Set(name)
     used, index = np.unique(corners, return_inverse=True)
-    points = _values(mesh.vertices, "co", width=3)[used]
-    usd.CreateDoubleSidedAttr(True)
     usd.CreateSubdivisionSchemeAttr("catmullClark" if modifier else "none")
-    values = {usd.CreatePointsAttr(): points, usd.CreateExtentAttr(): np.stack([points.min(0), points.max(0)])}
+    values = {usd.CreatePointsAttr(): _values(mesh.vertices, "co", width=3)[used]}
     values[usd.CreateFaceVertexCountsAttr()] = _values(mesh.polygons, "loop_total", np.int32)
     values[usd.CreateFaceVertexIndicesAttr()] = index.astype(np.int32)
     if modifier:
@@ -240,17 +236,16 @@ def _creases(mesh, used, use_creases):
 
 
 def meshes(export):
-    """Meshes are subdivided with modifiers below the subdivision; creases that are off; smooth corners of two edges.
+    """Meshes that are subdivided, as instances and where modifiers are below; corners of two edges; creases that are off.
 
-    Instances are subdivided, to be subdivided again; those of geometry nodes have the geometry of their owner. Bevelled
-    curves are curves, and surfaces of splines are missing.
+    Meshes of geometry nodes' instances are those of their owner. Bevelled curves are curves; splines' surfaces are missing.
     """
     if not export.written:
         geometry = [prim for prim in Usd.PrimRange(export.root) if prim.IsA(UsdGeom.Gprim)]
         for prim in geometry + export.others[::-1]:
             if prim in geometry or not prim.GetChildren():
                 export.stage.RemovePrim(prim.GetPath())
-    smooth, places, names, numbers = {}, [], {}, {}
+    smooth, names, numbers = {}, {}, {}
     for each in export.depsgraph.object_instances:
         if not (each.show_self and each.object.type == "MESH" and each.object.data.polygons):
             continue
@@ -273,17 +268,16 @@ def meshes(export):
                 slots = [*data.materials] if is_own else [slot.material for slot in each.object.material_slots]
                 write_mesh(export, path, data, slots, thing.name)
         if each.is_instance:
-            places.append((owner.GetPath(), names[key], frame.inverted() @ each.matrix_world))
+            number = numbers[owner, names[key]] = numbers.get((owner, names[key]), -1) + 1
+            path = owner.GetPath().AppendChild(f"{names[key].name.removeprefix('_class_')}_{number}")
+            place = UsdGeom.Xform.Define(export.stage, path)
+            place.GetPrim().GetInherits().SetInherits([names[key]])
+            place.GetPrim().SetInstanceable(True)
+            export.written[path] = export.time
+            export.put_matrix(place, frame.inverted() @ each.matrix_world)
     # Now that all are seen, as cages change the evaluated scene.
     for path, thing in smooth.items():
         write_cage(export, path, thing)
-    for owner, path, matrix in places:
-        number = numbers[owner, path] = numbers.get((owner, path), -1) + 1
-        place = UsdGeom.Xform.Define(export.stage, owner.AppendChild(f"{path.name.removeprefix('_class_')}_{number}"))
-        place.GetPrim().GetInherits().SetInherits([path])
-        place.GetPrim().SetInstanceable(True)
-        export.written[place.GetPath()] = export.time
-        export.put_matrix(place, matrix)
     for path in [path for path, time in export.written.items() if time is not None and export.is_animated]:
         # Particles are born and die.
         visibility = UsdGeom.Imageable.Get(export.stage, path).CreateVisibilityAttr()
@@ -366,8 +360,7 @@ def lights(export):
             warn(f'light "{thing.name}": left out: {", ".join(left)}')
         for name, value in values.items():
             export.put(prim.GetAttribute(f"inputs:{name}"), value)
-        if np.abs(np.array(shape) - np.eye(4)).max() > ROUNDING:
-            export.put_matrix(prim, shape)
+        export.put_matrix(prim, shape)
 
 
 def world(export):
@@ -447,10 +440,10 @@ def materials(export):
         node = _surface_node(source) if source and surface else None
         if not node:
             continue
-        if surface.GetShaderId() == "ND_surface":
-            _mend_other(material, surface, node)
         if node.type == "BSDF_PRINCIPLED":
             _mend_principled(name, node, surface)
+        else:
+            _mend_other(name, node, surface)
         for each in source.node_tree.nodes:
             if each.type in ATTRIBUTES:
                 _connect_attribute(name, each, material, surface)
@@ -458,19 +451,18 @@ def materials(export):
                 _blend(material, each, _shader(material, each))
 
 
-def _mend_other(material, surface, node):
+def _mend_other(material_name, node, surface):
     surface.CreateIdAttr("ND_open_pbr_surface_surfaceshader")
-    for given in [given for given in surface.GetInputs() if given.HasConnectedSource()]:
-        shader = UsdShade.Shader(given.GetValueProducingAttributes()[0].GetPrim())
+    for given in surface.GetInputs():
+        shader = UsdShade.Shader(next((each.GetPrim() for each in given.GetValueProducingAttributes()), surface))
         name, values = SURFACES.get(shader.GetShaderId(), (None, {}))
         if name:
             _copy_input(shader.GetInput("color"), surface, name)
-        else:
-            warn(f'material "{material.GetPrim().GetName()}": the {node.bl_label} is left out')
+        elif given.HasConnectedSource():
+            warn(f'material "{material_name}": the {node.bl_label} is left out')
         for name, value in values.items():
             surface.CreateInput(name, KINDS.Float).Set(value)
-    for end in ("bsdf", "edf", "opacity", "thin_walled"):
-        surface.GetPrim().RemoveProperty(f"inputs:{end}")
+        surface.GetPrim().RemoveProperty(given.GetFullName())
 
 
 def _mend_principled(name, node, surface):
@@ -541,7 +533,6 @@ class CageHook(bpy.types.USDHook):
 
     @staticmethod
     def on_export(context):
-        """Mend the stage, once."""
         layer = context.get_stage().GetRootLayer()
         if "export_cage" not in layer.customLayerData and context.get_stage().GetDefaultPrim():
             Export(context.get_stage(), context.get_depsgraph()).mend()
@@ -591,23 +582,22 @@ def export_file(arguments):
     parser.add_argument("--animation", action="store_true", help="write all frames instead of the current one")
     parser.add_argument("--blend", help="scene to open, where a Python with the package bpy runs this script")
     options = parser.parse_args(arguments)
-    root, extension = os.path.splitext(os.path.abspath(options.output))
-    is_obj = extension.lower() == ".obj"
-    if extension.lower() not in (".usda", ".usdc", ".obj"):
-        sys.exit(f'export_cage: "{options.output}" ends with "{extension}"; expected .usda, .usdc or .obj')
-    if not os.path.isdir(os.path.dirname(root)):
+    output = pathlib.Path(options.output).absolute()
+    is_obj = output.suffix == ".obj"
+    if output.suffix not in (".usda", ".usdc", ".obj"):
+        sys.exit(f'export_cage: "{options.output}" ends with "{output.suffix}"; expected .usda, .usdc or .obj')
+    if not output.parent.is_dir():
         sys.exit(f"export_cage: {options.output}: No such file or directory")
     if options.blend:
-        bpy.ops.wm.open_mainfile(filepath=os.path.abspath(options.blend))
+        bpy.ops.wm.open_mainfile(filepath=options.blend)
     # Beside the file and renamed, so that there is never half of one.
-    part = f"{root}.part{'.usda' if is_obj else extension}"
+    part = output.with_suffix(f".part{'.usda' if is_obj else output.suffix}")
     # Instead of skeletons and blended shapes, the vertices of each frame.
     kinds = {"export_armatures": False, "export_shapekeys": False, "export_animation": options.animation}
     kinds |= {"export_materials": not is_obj, "convert_world_material": not is_obj, "overwrite_textures": True}
-    kinds |= {"generate_materialx_network": True, "evaluation_mode": "RENDER"}
     try:
-        bpy.ops.wm.usd_export(filepath=part, **kinds)
-        stage = Usd.Stage.Open(part)
+        bpy.ops.wm.usd_export(filepath=str(part), evaluation_mode="RENDER", generate_materialx_network=True, **kinds)
+        stage = Usd.Stage.Open(str(part))
         prims = Usd.PrimRange(stage.GetDefaultPrim(), Usd.TraverseInstanceProxies())
         found = [(prim.GetAttribute(OBJECT_NAME).Get(), UsdGeom.Mesh(prim)) for prim in prims if prim.IsA(UsdGeom.Mesh)]
         cages = [(name, mesh) for name, mesh in found if mesh.GetSubdivisionSchemeAttr().Get() != "none"]
@@ -619,19 +609,16 @@ def export_file(arguments):
             sys.exit(f"export_cage: a render shows {what}; choose one with --object: {names}")
         if is_obj:
             warn(f"OBJ files hold one cage; other meshes that are left out: {len(found) - 1}")
-            text = obj_text(chosen[0])
-            with open(part, "w", encoding="utf-8", newline="\n") as file:
-                file.write(text)
+            part.write_text(obj_text(chosen[0]), encoding="utf-8", newline="\n")
         elif options.object:
             # Instances are left out as a whole.
             prims = [mesh.GetPrim() for name, mesh in found if name != options.object]
             for prim in [prim.GetParent() if prim.IsInstanceProxy() else prim for prim in prims]:
                 stage.RemovePrim(prim.GetPath())
             stage.Save()
-        os.replace(part, options.output)
+        part.replace(output)
     finally:
-        if os.path.exists(part):
-            os.remove(part)
+        part.unlink(missing_ok=True)
     count = sum(options.object in (None, name) for name, _ in cages)
     print(f"export_cage: {count} subdivision surfaces written to {options.output}", file=sys.stderr)
 
