@@ -8,8 +8,8 @@ Each function of ``MENDS`` mends faults of the exporter, which its docstring nam
 5.0.1. Where Blender mends them, the function goes. Above all, an object with a Subdivision Surface modifier becomes its
 cage: the mesh that the last such modifier gets, with the modifiers above it applied and those below it left out.
 
-It needs Blender 4.5 or newer, or a Python that has the package bpy. Installed as an add-on (Preferences, Add-ons,
-Install from Disk), this file mends what File > Export > Universal Scene Description writes.
+Installed as an add-on (Preferences, Add-ons, Install from Disk), this file mends what File > Export writes. As a script
+it needs Blender 4.5 or newer, or a Python that has the package bpy.
 """
 
 import argparse
@@ -36,8 +36,6 @@ FACE_VARYING = {
     "PRESERVE_CORNERS_JUNCTIONS_AND_CONCAVE": "cornersPlus2", "PRESERVE_BOUNDARIES": "boundaries", "NONE": "all",
 }  # fmt: skip
 INFINITE = 10.0  # OpenSubdiv's infinite sharpness.
-ROUNDING = 1e-4  # Of angles and transforms in single precision.
-GREY = (0.8, 0.8, 0.8)  # Of faces without a material.
 # Inputs of OpenPBR by those of the Principled BSDF, and colour and other inputs for the nodes of other surfaces.
 INPUTS = {
     "Base Color": "base_color", "Metallic": "base_metalness", "Roughness": "specular_roughness",
@@ -122,19 +120,14 @@ def _object_of(prim):
     return bpy.data.objects.get(prim.GetAttribute(OBJECT_NAME).Get() or "") if prim.HasAttribute(OBJECT_NAME) else None
 
 
-def _child(prim, schema, name):
-    return next((each.GetPath() for each in prim.GetChildren() if each.IsA(schema)), prim.GetPath().AppendChild(name))
-
-
-def subdivision_of(thing):
-    """The last Subdivision Surface modifier that a render applies; None without one, or if it does not smooth."""
+def _subdivision_of(thing):
     shown = [each for each in thing.modifiers if each.show_render and each.type == "SUBSURF" and each.render_levels > 0]
     return next((each for each in reversed(shown) if each.subdivision_type == "CATMULL_CLARK"), None)
 
 
 def write_cage(export, path, thing):
     """Write what the last Subdivision Surface modifier of an object gets."""
-    modifier = subdivision_of(thing)
+    modifier = _subdivision_of(thing)
     off = [each for each in list(thing.modifiers)[list(thing.modifiers).index(modifier) :] if each.show_render]
     left = [each.name for each in off if each.type != "SUBSURF"]
     if left:
@@ -154,9 +147,9 @@ def write_cage(export, path, thing):
 
 def write_mesh(export, path, mesh, slots, name, modifier=None):
     """Write a mesh; with a modifier as a cage, otherwise as polygons with normals."""
-    is_new = path not in export.written
     usd, corners = UsdGeom.Mesh.Define(export.stage, path), _values(mesh.loops, "vertex_index", np.int32)
-    if is_new:
+    primvars = UsdGeom.PrimvarsAPI(usd)
+    if path not in export.written:
         export.written[path] = None
         _bind(export, usd, _values(mesh.polygons, "material_index", np.int32), slots)
         usd.GetPrim().CreateAttribute(OBJECT_NAME, KINDS.String).Set(name)
@@ -175,7 +168,6 @@ def write_mesh(export, path, mesh, slots, name, modifier=None):
     else:
         values[usd.CreateNormalsAttr()] = _values(mesh.corner_normals, "vector", width=3)
         usd.SetNormalsInterpolation("faceVarying")
-    primvars = UsdGeom.PrimvarsAPI(usd)
     for layer in mesh.uv_layers:
         # Materials ask for maps by name, also for the one that is rendered.
         for map_name in ["st"] * layer.active_render + [Tf.MakeValidIdentifier(layer.name)]:
@@ -200,7 +192,7 @@ def _bind(export, usd, faces, slots):
     # A face whose slot is missing has the last one, as in Blender.
     faces = np.minimum(faces, max(len(slots) - 1, 0))
     used, api = np.unique(faces) if slots else (), UsdShade.MaterialBindingAPI.Apply(usd.GetPrim())
-    usd.CreateDisplayColorAttr([GREY])
+    usd.CreateDisplayColorAttr([(0.8, 0.8, 0.8)])  # Of faces without a material.
     for slot in (slot for slot in used if slots[slot]):
         name, target, these = slots[slot].name, api, np.flatnonzero(faces == slot).astype(np.int32)
         if len(used) > 1:
@@ -215,14 +207,12 @@ def _bind(export, usd, faces, slots):
 
 
 def _creases(mesh, used, use_creases):
-    """Creases and corners as Blender hands them to OpenSubdiv: the sharpness is ten times the square of the crease."""
+    # As Blender hands them to OpenSubdiv: the sharpness is ten times the square of the crease.
     edges = _values(mesh.edges, "vertices", np.int32, 2)
-
-    def sharpness_of(domain, count):
-        found = mesh.attributes.get(f"crease_{domain}") if use_creases else None
-        return np.zeros(count) if found is None else 10 * _values(found.data, "value").astype(float) ** 2
-
-    sharpness, corners = sharpness_of("edge", len(edges)), sharpness_of("vert", len(mesh.vertices))
+    found = [mesh.attributes.get(f"crease_{domain}") if use_creases else None for domain in ("edge", "vert")]
+    creases = [each and _values(each.data, "value").astype(float) for each in found]
+    sharpness = np.zeros(len(edges)) if creases[0] is None else 10 * creases[0] ** 2
+    corners = np.zeros(len(mesh.vertices)) if creases[1] is None else 10 * creases[1] ** 2
     has_face = np.isin(np.arange(len(edges)), _values(mesh.loops, "edge_index", np.int32))
     # So that a plane with four creases keeps its corners: the last value that is assigned is the least.
     order = np.flatnonzero(has_face)[np.argsort(-sharpness[has_face], kind="stable")]
@@ -236,9 +226,9 @@ def _creases(mesh, used, use_creases):
 
 
 def meshes(export):
-    """Meshes that are subdivided, as instances and where modifiers are below; corners of two edges; creases that are off.
+    """Meshes that are subdivided, as instances are and where modifiers are below; creases that are off.
 
-    Meshes of geometry nodes' instances are those of their owner. Bevelled curves are curves; splines' surfaces are missing.
+    Corners of two edges are smooth. Instances of geometry nodes have the mesh of their owner, bevelled curves none.
     """
     if not export.written:
         geometry = [prim for prim in Usd.PrimRange(export.root) if prim.IsA(UsdGeom.Gprim)]
@@ -262,7 +252,7 @@ def meshes(export):
             path = export.root.GetPath().AppendChild(f"_class_{Tf.MakeValidIdentifier(thing.name)}_{number}")
             names[key] = export.stage.CreateClassPrim(path).GetPath() if each.is_instance else owner.GetPath()
             path = names[key].AppendChild("Mesh")
-            if subdivision_of(thing) and not (is_own and thing.type == "MESH"):
+            if _subdivision_of(thing) and not (is_own and thing.type == "MESH"):
                 smooth[path] = thing
             else:
                 slots = [*data.materials] if is_own else [slot.material for slot in each.object.material_slots]
@@ -301,14 +291,28 @@ def told(export):
 
 
 def cameras(export):
-    """Orthographic cameras are missing, and shutters."""
-    render = export.scene.render
+    """No orthographic cameras, shutters, and render settings."""
+    scene, render, stage = export.scene, export.scene.render, export.stage
+    settings = UsdRender.Settings.Define(stage, "/Render/Settings")
+    stage.SetMetadata("renderSettingsPrimPath", "/Render/Settings")
+    size = (max(1, side * render.resolution_percentage // 100) for side in (render.resolution_x, render.resolution_y))
+    settings.CreateResolutionAttr(Gf.Vec2i(*size))
+    settings.CreatePixelAspectRatioAttr(render.pixel_aspect_x / render.pixel_aspect_y)
+    if render.use_border:
+        sides = (getattr(render, f"border_{side}") for side in ("min_x", "min_y", "max_x", "max_y"))
+        settings.CreateDataWindowNDCAttr(Gf.Vec4f(*sides))
+    settings.GetPrim().CreateAttribute("cycles:background:transparent", KINDS.Bool).Set(render.film_transparent)
+    settings.GetPrim().CreateAttribute("cycles:samples", KINDS.Int).Set(scene.cycles.samples)
     aspect = render.resolution_x * render.pixel_aspect_x / (render.resolution_y * render.pixel_aspect_y)
     for thing, prim in [(bpy.data.objects[name], prim) for name, prim in export.own.items()]:
         if thing.type != "CAMERA" or thing.data.type == "PANO":
             continue
         data, values = thing.evaluated_get(export.depsgraph).data, {}
-        camera = UsdGeom.Camera.Define(export.stage, _child(prim, UsdGeom.Camera, "Camera"))
+        found = [child.GetPath() for child in prim.GetChildren() if child.IsA(UsdGeom.Camera)]
+        camera = UsdGeom.Camera.Define(stage, found[0] if found else prim.GetPath().AppendChild("Camera"))
+        if thing == scene.camera:
+            settings.CreateCameraRel().SetTargets([camera.GetPath()])
+            camera.CreateExposureAttr(math.log2(scene.cycles.film_exposure))
         if data.type == "ORTHO":
             camera.CreateProjectionAttr("orthographic")
             size = 10 * data.ortho_scale  # In tenths of a unit.
@@ -318,9 +322,10 @@ def cameras(export):
             values |= {"horizontalApertureOffset": data.shift_x * size, "verticalApertureOffset": data.shift_y * size}
             values["clippingRange"] = Gf.Vec2f(data.clip_start, data.clip_end)
         if render.use_motion_blur and export.is_animated:
-            start = {"START": 0.0, "CENTER": -0.5, "END": -1.0}[render.motion_blur_position]
-            length = render.motion_blur_shutter
-            values |= {"shutter:open": start * length, "shutter:close": (start + 1) * length}
+            opens = {"START": 0.0, "CENTER": -0.5, "END": -1.0}[
+                render.motion_blur_position
+            ] * render.motion_blur_shutter
+            values |= {"shutter:open": opens, "shutter:close": opens + render.motion_blur_shutter}
         for each, value in values.items():
             export.put(camera.GetPrim().GetAttribute(each), value)
 
@@ -347,8 +352,7 @@ def lights(export):
         shape = thing.matrix_world.inverted_safe() @ thing.matrix_world.normalized()
         if light.type == "AREA":
             shape = mathutils.Matrix.Diagonal((1, light.size_y / light.size if light.shape == "ELLIPSE" else 1, 1, 1))
-            left += ["its spread"] * (light.spread < math.pi - ROUNDING)
-            left += ["that it is a portal"] * light.cycles.is_portal
+            left += ["its spread"] * (light.spread < 3.14159) + ["that it is a portal"] * light.cycles.is_portal
         elif light.type == "SPOT":
             # Blender blends by cosines, USD by angles; both ends are the same.
             half, edge = light.spot_size / 2, math.cos(light.spot_size / 2)
@@ -365,7 +369,7 @@ def lights(export):
 
 def world(export):
     """An image lies on its side and lacks its strength; a colour is an image, too."""
-    source, path = export.scene.world, _child(export.root, UsdLux.DomeLight, "env_light")
+    source, path = export.scene.world, export.root.GetPath().AppendChild("env_light")
     node = _surface_node(source) if source else None
     found = _origin(node.inputs["Color"]) if node and node.type == "BACKGROUND" else None
     texture = found[0] if found and found[0].type == "TEX_ENVIRONMENT" else None
@@ -378,17 +382,17 @@ def world(export):
         dome = UsdLux.DomeLight.Define(export.stage, path)
         export.put(dome.CreateIntensityAttr(), node.inputs["Strength"].default_value if node else 1.0)
         export.put(dome.CreateColorAttr(), color)
-        if not texture:
+        if texture:
+            dome.SetXformOpOrder([])
+            export.put_matrix(dome, (turn @ DOME).to_4x4())
+        else:
             dome.GetPrim().RemoveProperty("inputs:texture:file")
-            return
-        dome.SetXformOpOrder([])
-        export.put_matrix(dome, (turn @ DOME).to_4x4())
-        if (texture.image.colorspace_settings.name == "sRGB") == texture.image.is_float:
+        if texture and (texture.image.colorspace_settings.name == "sRGB") == texture.image.is_float:
             warn(f'world "{source.name}": its image is taken as sRGB if it has eight bits, and else as linear')
 
 
 def _environment_turn(node):
-    """Rotation of an environment image; None if its coordinates are others than turned directions."""
+    # None if the coordinates are others than turned directions.
     source, turn = _origin(node.inputs["Vector"]), mathutils.Matrix.Identity(3)
     if source and source[0].type == "MAPPING" and source[0].vector_type == "POINT":
         _, place, rotation, scale = source[0].inputs
@@ -397,26 +401,6 @@ def _environment_turn(node):
         turn, source = rotation.default_value.to_matrix().inverted(), _origin(source[0].inputs["Vector"])
     is_direction = not source or (source[0].type == "TEX_COORD" and source[1].name == "Generated")
     return turn if is_direction and node.projection == "EQUIRECTANGULAR" and node.image else None
-
-
-def film(export):
-    """The stage has no render settings."""
-    scene, render, stage = export.scene, export.scene.render, export.stage
-    settings = UsdRender.Settings.Define(stage, "/Render/Settings")
-    stage.SetMetadata("renderSettingsPrimPath", "/Render/Settings")
-    size = (max(1, side * render.resolution_percentage // 100) for side in (render.resolution_x, render.resolution_y))
-    settings.CreateResolutionAttr(Gf.Vec2i(*size))
-    settings.CreatePixelAspectRatioAttr(render.pixel_aspect_x / render.pixel_aspect_y)
-    if render.use_border:
-        sides = (getattr(render, f"border_{side}") for side in ("min_x", "min_y", "max_x", "max_y"))
-        settings.CreateDataWindowNDCAttr(Gf.Vec4f(*sides))
-    settings.GetPrim().CreateAttribute("cycles:background:transparent", KINDS.Bool).Set(render.film_transparent)
-    settings.GetPrim().CreateAttribute("cycles:samples", KINDS.Int).Set(scene.cycles.samples)
-    if scene.cycles.film_exposure != 1:
-        warn(f"the exposure of the film, {scene.cycles.film_exposure:g}, is left out")
-    if scene.camera and scene.camera.name in export.own:
-        path = _child(export.own[scene.camera.name], UsdGeom.Camera, "Camera")
-        settings.CreateCameraRel().SetTargets([path])
 
 
 def _surface_node(owner):
@@ -440,10 +424,7 @@ def materials(export):
         node = _surface_node(source) if source and surface else None
         if not node:
             continue
-        if node.type == "BSDF_PRINCIPLED":
-            _mend_principled(name, node, surface)
-        else:
-            _mend_other(name, node, surface)
+        (_mend_principled if node.type == "BSDF_PRINCIPLED" else _mend_other)(name, node, surface)
         for each in source.node_tree.nodes:
             if each.type in ATTRIBUTES:
                 _connect_attribute(name, each, material, surface)
@@ -510,7 +491,7 @@ def _blend(material, node, shader):
 
 
 def _shader(material, node, output="Result_Color"):
-    """Shader of the colour that a node mixes, or a new one by a definition of MaterialX."""
+    # That of the colour that a node mixes, or a new one by a definition of MaterialX.
     path = material.GetPath().AppendPath(f"NodeGraphs/bnode__{Tf.MakeValidIdentifier(node.name)}_{output}")
     if output == "Result_Color":
         return UsdShade.Shader.Get(material.GetPrim().GetStage(), path)
@@ -520,10 +501,8 @@ def _shader(material, node, output="Result_Color"):
 
 
 def _copy_input(given, shader, name):
-    made = shader.CreateInput(name, given.GetTypeName())
-    made.GetAttr().SetConnections(given.GetAttr().GetConnections())
-    if given.Get() is not None:
-        made.Set(given.Get())
+    layer, path = given.GetAttr().GetStage().GetRootLayer(), shader.GetPath().AppendProperty(f"inputs:{name}")
+    Sdf.CopySpec(layer, given.GetAttr().GetPath(), layer, path)
 
 
 class CageHook(bpy.types.USDHook):
@@ -540,7 +519,7 @@ class CageHook(bpy.types.USDHook):
         return True
 
 
-MENDS, MENDS_OF_FRAMES = (told, materials, film), (meshes, cameras, lights, world)
+MENDS, MENDS_OF_FRAMES = (told, materials), (meshes, cameras, lights, world)
 register, unregister = bpy.utils.register_classes_factory((CageHook,))
 
 
@@ -593,10 +572,11 @@ def export_file(arguments):
     # Beside the file and renamed, so that there is never half of one.
     part = output.with_suffix(f".part{'.usda' if is_obj else output.suffix}")
     # Instead of skeletons and blended shapes, the vertices of each frame.
-    kinds = {"export_armatures": False, "export_shapekeys": False, "export_animation": options.animation}
-    kinds |= {"export_materials": not is_obj, "convert_world_material": not is_obj, "overwrite_textures": True}
+    kinds = dict.fromkeys(("export_armatures", "export_shapekeys"), False)
+    kinds |= dict.fromkeys(("export_materials", "convert_world_material", "generate_materialx_network"), not is_obj)
+    kinds |= {"allow_unicode": True, "overwrite_textures": True, "export_animation": options.animation}
     try:
-        bpy.ops.wm.usd_export(filepath=str(part), evaluation_mode="RENDER", generate_materialx_network=True, **kinds)
+        bpy.ops.wm.usd_export(filepath=str(part), evaluation_mode="RENDER", **kinds)
         stage = Usd.Stage.Open(str(part))
         prims = Usd.PrimRange(stage.GetDefaultPrim(), Usd.TraverseInstanceProxies())
         found = [(prim.GetAttribute(OBJECT_NAME).Get(), UsdGeom.Mesh(prim)) for prim in prims if prim.IsA(UsdGeom.Mesh)]
