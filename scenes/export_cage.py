@@ -2,14 +2,13 @@
 
     blender -b model.blend --python export_cage.py -- model.usda
     blender -b model.blend --python export_cage.py -- model.obj --object Chair
-    python export_cage.py model.usda --blend model.blend
 
 Each function of ``MENDS`` mends faults of the exporter, which its docstring names; all were seen in Blender 4.5.1 and
 5.0.1. Where Blender mends them, the function goes. Above all, an object with a Subdivision Surface modifier becomes its
 cage: the mesh that the last such modifier gets, with the modifiers above it applied and those below it left out.
 
 Installed as an add-on (Preferences, Add-ons, Install from Disk), this file mends what File > Export writes. As a script
-it needs Blender 4.5 or newer, or a Python that has the package bpy.
+it needs Blender 4.5 or newer, or a Python that has the package bpy, and the option --blend.
 """
 
 import argparse
@@ -64,8 +63,8 @@ class Export:
     def __init__(self, stage, depsgraph):
         self.stage, self.depsgraph, self.scene = stage, depsgraph, depsgraph.scene
         self.root, self.time = stage.GetDefaultPrim(), Usd.TimeCode.Default()
-        self.values, self.written = {}, {}  # Of attributes, and last times of meshes and instances, by path.
-        self.is_animated = stage.HasAuthoredTimeCodeRange()
+        # Values of attributes, and last times of meshes and instances, by path.
+        self.is_animated, self.values, self.written = stage.HasAuthoredTimeCodeRange(), {}, {}
         found = [prim for prim in stage.Traverse() if prim.IsA(UsdShade.Material) and prim.HasAttribute(DATA_NAME)]
         self.materials = {prim.GetAttribute(DATA_NAME).Get(): UsdShade.Material(prim) for prim in found}
         # Prims of objects themselves, by name; others with the name of an object are its instances.
@@ -103,12 +102,11 @@ class Export:
             attribute.Clear()
             attribute.Set(value)
         old, time, moves = self.values.get(path, (value, None, False))
-        if not moves and old != value:
+        if old != value and not moves:
             attribute.Set(old, time)
-            moves = True
-        if moves:
+        if moves or old != value:
             attribute.Set(value, self.time)
-        self.values[path] = value, self.time, moves
+        self.values[path] = value, self.time, moves or old != value
 
     def put_matrix(self, prim, matrix):
         place = UsdGeom.Xformable(prim)
@@ -129,8 +127,7 @@ def write_cage(export, path, thing):
     """Write what the last Subdivision Surface modifier of an object gets."""
     modifier = _subdivision_of(thing)
     off = [each for each in list(thing.modifiers)[list(thing.modifiers).index(modifier) :] if each.show_render]
-    left = [each.name for each in off if each.type != "SUBSURF"]
-    if left:
+    if left := [each.name for each in off if each.type != "SUBSURF"]:
         warn(f'object "{thing.name}": modifiers below "{modifier.name}" are left out: {", ".join(left)}')
     # One object after the other: Boolean and others apply the smooth surfaces of other objects.
     for is_shown in (False, True):
@@ -196,9 +193,8 @@ def _bind(export, usd, faces, slots):
     for slot in (slot for slot in used if slots[slot]):
         name, target, these = slots[slot].name, api, np.flatnonzero(faces == slot).astype(np.int32)
         if len(used) > 1:
-            subset = api.CreateMaterialBindSubset(
-                f"{Tf.MakeValidIdentifier(name)}_{slot}", Vt.IntArray.FromNumpy(these)
-            )
+            part = f"{Tf.MakeValidIdentifier(name)}_{slot}"
+            subset = api.CreateMaterialBindSubset(part, Vt.IntArray.FromNumpy(these))
             target = UsdShade.MaterialBindingAPI.Apply(subset.GetPrim())
         if name in export.materials:
             target.Bind(export.materials[name])
@@ -269,7 +265,6 @@ def meshes(export):
     for path, thing in smooth.items():
         write_cage(export, path, thing)
     for path in [path for path, time in export.written.items() if time is not None and export.is_animated]:
-        # Particles are born and die.
         visibility = UsdGeom.Imageable.Get(export.stage, path).CreateVisibilityAttr()
         export.put(visibility, "inherited" if export.written[path] == export.time else "invisible")
 
@@ -322,9 +317,8 @@ def cameras(export):
             values |= {"horizontalApertureOffset": data.shift_x * size, "verticalApertureOffset": data.shift_y * size}
             values["clippingRange"] = Gf.Vec2f(data.clip_start, data.clip_end)
         if render.use_motion_blur and export.is_animated:
-            opens = {"START": 0.0, "CENTER": -0.5, "END": -1.0}[
-                render.motion_blur_position
-            ] * render.motion_blur_shutter
+            starts = {"START": 0.0, "CENTER": -0.5, "END": -1.0}
+            opens = starts[render.motion_blur_position] * render.motion_blur_shutter
             values |= {"shutter:open": opens, "shutter:close": opens + render.motion_blur_shutter}
         for each, value in values.items():
             export.put(camera.GetPrim().GetAttribute(each), value)
@@ -392,7 +386,6 @@ def world(export):
 
 
 def _environment_turn(node):
-    # None if the coordinates are others than turned directions.
     source, turn = _origin(node.inputs["Vector"]), mathutils.Matrix.Identity(3)
     if source and source[0].type == "MAPPING" and source[0].vector_type == "POINT":
         _, place, rotation, scale = source[0].inputs
@@ -455,11 +448,8 @@ def _mend_principled(name, node, surface):
         surface.CreateInput("specular_weight", KINDS.Float).Set(1.0)
     for label, key in INPUTS.items():
         found, given = _origin(node.inputs[label]), surface.GetInput(key)
-        if (
-            found
-            and not (given and given.HasConnectedSource())
-            and found[0].type not in (*ATTRIBUTES, "RGB", "VALUE", "MIX")
-        ):
+        is_lost = found and found[0].type not in (*ATTRIBUTES, "RGB", "VALUE", "MIX")
+        if is_lost and not (given and given.HasConnectedSource()):
             warn(f'material "{name}": the {found[0].bl_label} at "{label}" is left out')
 
 
@@ -481,7 +471,6 @@ def _blend(material, node, shader):
     if shader and node.blend_type in BLENDS:
         shader.CreateIdAttr(f"ND_{BLENDS[node.blend_type]}_color3")
     elif shader and node.blend_type == "MULTIPLY":
-        # The foreground of a mixture is the product.
         product = _shader(material, node, "multiply_color3")
         _copy_input(shader.GetInput("bg"), product, "in1")
         _copy_input(shader.GetInput("fg"), product, "in2")
@@ -491,7 +480,6 @@ def _blend(material, node, shader):
 
 
 def _shader(material, node, output="Result_Color"):
-    # That of the colour that a node mixes, or a new one by a definition of MaterialX.
     path = material.GetPath().AppendPath(f"NodeGraphs/bnode__{Tf.MakeValidIdentifier(node.name)}_{output}")
     if output == "Result_Color":
         return UsdShade.Shader.Get(material.GetPrim().GetStage(), path)
@@ -585,13 +573,12 @@ def export_file(arguments):
         chosen = [mesh for name, mesh in expected if options.object in (None, name)]
         if not chosen or (is_obj and len(chosen) > 1):
             names = ", ".join(f'"{name}"' for name in sorted({name for name, _ in expected}))
-            what = f"{len(chosen)} {'cages' if is_obj else 'meshes'} of {options.object or 'all objects'}"
-            sys.exit(f"export_cage: a render shows {what}; choose one with --object: {names}")
+            what = f"{len(chosen)} {'cages' if is_obj else 'meshes'} of {options.object or 'all objects'}; choose one"
+            sys.exit(f"export_cage: a render shows {what} with --object: {names}")
         if is_obj:
             warn(f"OBJ files hold one cage; other meshes that are left out: {len(found) - 1}")
             part.write_text(obj_text(chosen[0]), encoding="utf-8", newline="\n")
         elif options.object:
-            # Instances are left out as a whole.
             prims = [mesh.GetPrim() for name, mesh in found if name != options.object]
             for prim in [prim.GetParent() if prim.IsInstanceProxy() else prim for prim in prims]:
                 stage.RemovePrim(prim.GetPath())
