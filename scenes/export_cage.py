@@ -516,11 +516,11 @@ def obj_text(mesh):
     matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(mesh.GetPrim()))
     points = np.array(mesh.GetPointsAttr().Get(), float) @ matrix[:3, :3] + matrix[3, :3]
     corners, ends = np.array(mesh.GetFaceVertexIndicesAttr().Get()), np.cumsum(mesh.GetFaceVertexCountsAttr().Get())
-    starts, uvs = np.append(0, ends[:-1]), UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get()
+    starts, primvar = np.append(0, ends[:-1]), UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st")
     lines, texts = [f"v {x!r} {y!r} {z!r}" for x, y, z in points.tolist()], [f"{vertex + 1}" for vertex in corners]
-    if uvs:
+    if primvar:
         # Shared by corners of a vertex whose faces have the same winding in the plane of the texture, as in Blender.
-        uvs, after = np.array(uvs, float), np.arange(1, len(corners) + 1)
+        uvs, after = np.array(primvar.Get(), float), np.arange(1, len(corners) + 1)
         after[ends - 1] = starts
         areas = np.add.reduceat(uvs[:, 0] * uvs[after, 1] - uvs[:, 1] * uvs[after, 0], starts)
         keys = np.column_stack([corners, np.repeat(areas > 0, ends - starts), uvs])

@@ -216,11 +216,12 @@ def run_commands(block):
             python = os.environ.get("BLENDER") or (find_spec("bpy") and sys.executable)
             if shutil.which(first) is None and not python:
                 pytest.skip("there is neither the program blender nor the package bpy")
+            command = words
             if shutil.which(first) is None:
                 scene = [f"--blend={word}" for word in words[1:3] if word.endswith(".blend")]
-                words = [python, words[words.index("--python") + 1], *words[words.index("--") :], *scene]
+                command = [python, words[words.index("--python") + 1], *words[words.index("--") :], *scene]
             here = {**os.environ, "PWD": os.getcwd()}  # Where Blender looks for the folder that it works in.
-            done = subprocess.run(words, env=here, capture_output=True, text=True, timeout=100, check=False)
+            done = subprocess.run(command, env=here, capture_output=True, text=True, timeout=100, check=False)
             assert done.returncode == 0, (str(block), done.stderr)
         elif "/" in first:
             assert os.access(ROOT / first, os.X_OK), words
