@@ -44,7 +44,6 @@ DIFFUSE = "base_color", {"specular_weight": 0.0}
 EMISSION = "emission_color", {"base_weight": 0.0, "specular_weight": 0.0, "emission_luminance": 1.0}
 SURFACES = {"ND_oren_nayar_diffuse_bsdf": DIFFUSE, "ND_burley_diffuse_bsdf": DIFFUSE, "ND_uniform_edf": EMISSION}
 BLENDS = {"ADD": "plus", "SUBTRACT": "minus", "SCREEN": "screen", "OVERLAY": "overlay", "DIFFERENCE": "difference"}
-ATTRIBUTES = ("VERTEX_COLOR", "ATTRIBUTE")
 # From Blender's axes to those of a dome: the middle of an image is at x instead of z, and z is up instead of y.
 DOME = mathutils.Matrix(((0, 0, 1), (1, 0, 0), (0, 1, 0)))
 OBJECT_NAME, DATA_NAME = "userProperties:blender:object_name", "userProperties:blender:data_name"
@@ -419,7 +418,7 @@ def materials(export):
             continue
         (_mend_principled if node.type == "BSDF_PRINCIPLED" else _mend_other)(name, node, surface)
         for each in source.node_tree.nodes:
-            if each.type in ATTRIBUTES:
+            if each.type in ("VERTEX_COLOR", "ATTRIBUTE"):
                 _connect_attribute(name, each, material, surface)
             if each.type == "MIX" and each.data_type == "RGBA" and each.blend_type != "MIX":
                 _blend(material, each, _shader(material, each))
@@ -448,7 +447,7 @@ def _mend_principled(name, node, surface):
         surface.CreateInput("specular_weight", KINDS.Float).Set(1.0)
     for label, key in INPUTS.items():
         found, given = _origin(node.inputs[label]), surface.GetInput(key)
-        is_lost = found and found[0].type not in (*ATTRIBUTES, "RGB", "VALUE", "MIX")
+        is_lost = found and found[0].type not in ("VERTEX_COLOR", "ATTRIBUTE", "RGB", "VALUE", "MIX")
         if is_lost and not (given and given.HasConnectedSource()):
             warn(f'material "{name}": the {found[0].bl_label} at "{label}" is left out')
 
@@ -479,9 +478,10 @@ def _blend(material, node, shader):
         warn(f'material "{material.GetPrim().GetName()}": the {node.blend_type.lower()} of "{node.name}" is a mixture')
 
 
-def _shader(material, node, output="Result_Color"):
-    path = material.GetPath().AppendPath(f"NodeGraphs/bnode__{Tf.MakeValidIdentifier(node.name)}_{output}")
-    if output == "Result_Color":
+def _shader(material, node, output=None):
+    start, mixed = ("bnode__", "Result_Color") if bpy.app.version >= (5, 0) else ("", "Result")
+    path = material.GetPath().AppendPath(f"NodeGraphs/{start}{Tf.MakeValidIdentifier(node.name)}_{output or mixed}")
+    if output is None:
         return UsdShade.Shader.Get(material.GetPrim().GetStage(), path)
     made = UsdShade.Shader.Define(material.GetPrim().GetStage(), path)
     made.CreateIdAttr(f"ND_{output}")

@@ -267,6 +267,7 @@ def make_shown(model, points):
 
     bpy.utils.register_class(Seen)
     bpy.ops.wm.usd_export(filepath=model + ".usda", evaluation_mode="RENDER")
+    bpy.utils.unregister_class(Seen)
     with open(points, "w") as file:
         json.dump(found, file)
 
