@@ -1,10 +1,8 @@
-"""A script for Blender: makes scenes.
+"""A script for Blender: makes scenes. ``blender -b --python scenes.py -- KIND SCENE.blend OTHER`` also writes for the
 
-``blender -b --python scenes.py -- model MODEL.blend ANSWERS.json`` tells what Blender's own subdivision of it is.
-
-``blender -b --python scenes.py -- look LOOK.blend PICTURE.exr`` renders the scene with Cycles.
-
-``blender -b --python scenes.py -- shown SHOWN.blend POINTS.json`` tells the points of each object in a render.
+- ``model``: what Blender's own subdivision of it is;
+- ``look``: a picture by Cycles;
+- ``shown``: the points of each object in a render.
 """
 
 import itertools
@@ -53,8 +51,10 @@ def house():
     mesh.from_pydata(POINTS, [], FACES)
     mesh.update()
     edges = [tuple(sorted(edge.vertices)) for edge in mesh.edges]
-    set_creases(mesh, "EDGE", [EDGE_CREASES.get(edge, 0.0) for edge in edges])
-    set_creases(mesh, "POINT", [VERTEX_CREASES.get(vertex, 0.0) for vertex in range(len(POINTS))])
+    creases = mesh.attributes.new("crease_edge", "FLOAT", "EDGE").data
+    creases.foreach_set("value", [EDGE_CREASES.get(edge, 0.0) for edge in edges])
+    creases = mesh.attributes.new("crease_vert", "FLOAT", "POINT").data
+    creases.foreach_set("value", [VERTEX_CREASES.get(vertex, 0.0) for vertex in range(len(POINTS))])
     uv = mesh.uv_layers.new(name="UVMap").data
     for face in mesh.polygons:
         for corner, vertex in zip(face.loop_indices, face.vertices, strict=True):
@@ -68,23 +68,6 @@ def house():
             else:
                 uv[corner].uv = (0.1 * x + 0.8, 0.1 * z)
     return mesh
-
-
-def set_creases(mesh, domain, values):
-    if bpy.app.version >= (4, 0):
-        name = {"EDGE": "crease_edge", "POINT": "crease_vert"}[domain]
-        mesh.attributes.new(name, "FLOAT", domain).data.foreach_set("value", values)
-    elif domain == "EDGE":
-        mesh.edges.foreach_set("crease", values)
-    else:
-        import bmesh
-
-        editable = bmesh.new()
-        editable.from_mesh(mesh)
-        layer = editable.verts.layers.crease.verify()
-        for vertex, value in zip(editable.verts, values, strict=True):
-            vertex[layer] = value
-        editable.to_mesh(mesh)
 
 
 def add_subdivided(name, data, **settings):
@@ -127,11 +110,8 @@ def dress(mesh):
         add(name, data, (0.0, -8.0, 3.0 + number), (1.2, 0.0, 0.0))
     bpy.context.scene.camera = bpy.data.objects["Camera"]
     bpy.context.scene.world = bpy.data.worlds.new("World")
-    if bpy.app.version < (5, 0):
-        bpy.context.scene.world.color = (0.1, 0.2, 0.3)
-    else:
-        background = bpy.context.scene.world.node_tree.nodes["Background"]
-        background.inputs["Color"].default_value = (0.1, 0.2, 0.3, 1.0)
+    background = tree_of(bpy.context.scene.world).nodes["Background"]
+    background.inputs["Color"].default_value = (0.1, 0.2, 0.3, 1.0)
 
 
 def make_model(model, answers):
@@ -163,8 +143,6 @@ def make_model(model, answers):
     add("Smooth", smooth)
     dress(mesh)
     bpy.ops.wm.save_as_mainfile(filepath=model)
-    # Versions before 4.0 round creases when they save.
-    bpy.ops.wm.open_mainfile(filepath=model)
     with open(answers, "w") as file:
         json.dump({name: subdivided(bpy.data.objects[name]) for name in compared}, file)
 
@@ -213,21 +191,14 @@ def make_shown(model, points):
     cube("child")[0].parent = frame
     hairs = cube("emitter", "PARTICLE_SYSTEM")[1].particle_system.settings
     hairs.type, hairs.count, hairs.render_type, hairs.instance_object = "HAIR", 5, "OBJECT", part
-    # Geometry nodes that instance a part at three points of a line.
-    for way in ("INPUT", "OUTPUT"):
-        nodes.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
-    info, line, on_points, join, start, end = (
-        nodes.nodes.new(kind)
-        for kind in ("GeometryNodeObjectInfo", "GeometryNodeMeshLine", "GeometryNodeInstanceOnPoints",
-                     "GeometryNodeJoinGeometry", "NodeGroupInput", "NodeGroupOutput")
-    )  # fmt: skip
-    info.inputs["Object"].default_value, info.inputs["As Instance"].default_value = part, True
+    # Geometry nodes that instance a cube at three points of a line.
+    nodes.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    kinds = "GeometryNodeMeshCube", "GeometryNodeMeshLine", "GeometryNodeInstanceOnPoints", "NodeGroupOutput"
+    box, line, on_points, end = map(nodes.nodes.new, kinds)
     line.inputs["Count"].default_value = 3
-    for source, name, target, socket in (
-        (line, 0, on_points, "Points"), (info, "Geometry", on_points, "Instance"), (on_points, 0, join, 0),
-        (start, 0, join, 0), (join, 0, end, 0),
-    ):  # fmt: skip
-        nodes.links.new(source.outputs[name], target.inputs[socket])
+    nodes.links.new(line.outputs[0], on_points.inputs["Points"])
+    nodes.links.new(box.outputs["Mesh"], on_points.inputs["Instance"])
+    nodes.links.new(on_points.outputs[0], end.inputs[0])
     cube("nodes", "NODES")[1].node_group = nodes
     cube("thick", "SUBSURF", "SOLIDIFY")
     # What moves.
@@ -257,7 +228,7 @@ def make_shown(model, points):
         @staticmethod
         def on_export(context):
             for each in context.get_depsgraph().object_instances:
-                if each.show_self and each.object.type == "MESH":
+                if each.show_self and each.object.type == "MESH" and each.object.data.polygons:
                     points = [tuple(each.matrix_world @ vertex.co) for vertex in each.object.data.vertices]
                     found.setdefault(each.object.name, []).append(points)
             return True
@@ -276,7 +247,6 @@ TEXELS = 32
 COLUMNS, DISTANCE = 4, 2.2
 SIZE = (96, 72)
 SAMPLES = 256
-EXTENSION = "MIRROR" if bpy.app.version >= (3, 5) else "EXTEND"
 
 
 def image(name, value, folder, *, is_data=False, is_float=False, is_packed=False):
@@ -361,7 +331,7 @@ def tiles(folder):
     Tile().color(ramp)
     tile = Tile()
     texcoord = tile.node("ShaderNodeTexCoord").outputs["UV"]
-    tile.color(ramp, mapping(tile.tree, texcoord, (0.2, 0.1, 0), (0, 0, 0.5), (2, 1.5, 1)), extension=EXTENSION)
+    tile.color(ramp, mapping(tile.tree, texcoord, (0.2, 0.1, 0), (0, 0, 0.5), (2, 1.5, 1)), extension="MIRROR")
     Tile().color(stripes)
     tile = Tile().color(leaf)
     tile.set("Alpha", tile.surface.inputs["Base Color"].links[0].from_node.outputs["Alpha"])
@@ -371,7 +341,7 @@ def tiles(folder):
     tile.set("Roughness", channels.outputs["Green"])
     tile.set("Metallic", channels.outputs["Blue"])
     tile = Tile(Emission_Strength=2.0, Base_Color=(0.1, 0.1, 0.1, 1.0))
-    tile.set("Emission Color" if bpy.app.version >= (4, 0) else "Emission", tile.picture(glow)["Color"])
+    tile.set("Emission Color", tile.picture(glow)["Color"])
     tile = Tile()
     turned = tile.node("ShaderNodeNormalMap")
     turned.inputs["Strength"].default_value = 0.7
@@ -407,13 +377,6 @@ def what_is_left_out():
     lamp = bpy.data.lights.new("Lamp", "AREA")
     lamp.spread, lamp.energy = 1.0, 0.0
     add("Lamp", lamp)
-    curve = bpy.data.curves.new("Wire", "CURVE")
-    curve.splines.new("POLY").points.add(1)
-    curve.splines[0].points[1].co = (1, 0, 0, 1)
-    add("Line", curve, (0, -30, 0))
-    wire = curve.copy()
-    wire.bevel_depth = 0.1
-    add("Wire", wire, (0, -30, 0)).modifiers.new("Subdivision", "SUBSURF").render_levels = 2
 
 
 def sky(folder):

