@@ -109,7 +109,11 @@ def main(path):
     for face in mesh.polygons:
         face.use_smooth = True
         face.material_index = int(face.index in inside)
-    add("Mug", mesh).modifiers.new("Subdivision", "SUBSURF")
+    thing = add("Mug", mesh)
+    thing.modifiers.new("Subdivision", "SUBSURF")
+    for frame, turn in ((1, 0.0), (24, math.pi / 3)):
+        thing.rotation_euler.z = turn
+        thing.keyframe_insert("rotation_euler", frame=frame)
     table = bpy.data.meshes.new("Table")
     table.from_pydata([(-20, -20, 0), (20, -20, 0), (20, 20, 0), (-20, 20, 0)], [], [(0, 1, 2, 3)])
     table.materials.append(material("Table", (0.55, 0.5, 0.45), 0.7))
@@ -120,6 +124,7 @@ def main(path):
     lens = bpy.data.cameras.new("Camera")
     lens.lens = 60.0
     scene = bpy.context.scene
+    scene.frame_end, scene.render.use_motion_blur = 24, True
     scene.camera = add("Camera", lens, (2.6, -5.8, 4.0), (0.35, 0.0, 1.0))
     scene.render.resolution_x, scene.render.resolution_y = 640, 480
     scene.world = bpy.data.worlds.new("World")

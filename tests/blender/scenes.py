@@ -1,9 +1,8 @@
-"""A script for Blender: makes scenes.
+"""A script for Blender: makes scenes. ``blender -b --python scenes.py -- KIND SCENE.blend OTHER`` also writes for the
 
-``blender -b --python scenes.py -- model MODEL.blend ANSWERS.json`` tells what Blender's own subdivision of it is. From
-Blender 5.0 on, its own exporter writes the scene as well, beside the model: ``own.usda``.
-
-``blender -b --python scenes.py -- look LOOK.blend PICTURE.exr`` renders the scene with Cycles.
+- ``model``: what Blender's own subdivision of it is;
+- ``look``: a picture by Cycles;
+- ``shown``: the points of each object in a render.
 """
 
 import itertools
@@ -24,6 +23,8 @@ FACES = [*SIDES, *((i, (i + 1) % 5, 14) for i in range(5)), (6, 5, 10, 13, 11), 
 # Of edges, by their vertices, and of vertices.
 EDGE_CREASES = {(0, 1): 1.0, (1, 2): 0.5, (2, 7): 0.3, (5, 10): 0.6, (10, 13): 0.4, (0, 5): 0.2, (8, 9): 0.7}
 VERTEX_CREASES = {4: 0.55, 9: 1.0, 13: 0.3}
+CORNERS = list(itertools.product((-1.0, 1.0), repeat=3))
+SQUARES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
 TETRAHEDRON = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
 BOUNDARIES, UV_RULES = (
     bpy.types.SubsurfModifier.bl_rna.properties[name].enum_items.keys() for name in ("boundary_smooth", "uv_smooth")
@@ -50,8 +51,10 @@ def house():
     mesh.from_pydata(POINTS, [], FACES)
     mesh.update()
     edges = [tuple(sorted(edge.vertices)) for edge in mesh.edges]
-    set_creases(mesh, "EDGE", [EDGE_CREASES.get(edge, 0.0) for edge in edges])
-    set_creases(mesh, "POINT", [VERTEX_CREASES.get(vertex, 0.0) for vertex in range(len(POINTS))])
+    creases = mesh.attributes.new("crease_edge", "FLOAT", "EDGE").data
+    creases.foreach_set("value", [EDGE_CREASES.get(edge, 0.0) for edge in edges])
+    creases = mesh.attributes.new("crease_vert", "FLOAT", "POINT").data
+    creases.foreach_set("value", [VERTEX_CREASES.get(vertex, 0.0) for vertex in range(len(POINTS))])
     uv = mesh.uv_layers.new(name="UVMap").data
     for face in mesh.polygons:
         for corner, vertex in zip(face.loop_indices, face.vertices, strict=True):
@@ -65,23 +68,6 @@ def house():
             else:
                 uv[corner].uv = (0.1 * x + 0.8, 0.1 * z)
     return mesh
-
-
-def set_creases(mesh, domain, values):
-    if bpy.app.version >= (4, 0):
-        name = {"EDGE": "crease_edge", "POINT": "crease_vert"}[domain]
-        mesh.attributes.new(name, "FLOAT", domain).data.foreach_set("value", values)
-    elif domain == "EDGE":
-        mesh.edges.foreach_set("crease", values)
-    else:
-        import bmesh
-
-        editable = bmesh.new()
-        editable.from_mesh(mesh)
-        layer = editable.verts.layers.crease.verify()
-        for vertex, value in zip(editable.verts, values, strict=True):
-            vertex[layer] = value
-        editable.to_mesh(mesh)
 
 
 def add_subdivided(name, data, **settings):
@@ -124,11 +110,8 @@ def dress(mesh):
         add(name, data, (0.0, -8.0, 3.0 + number), (1.2, 0.0, 0.0))
     bpy.context.scene.camera = bpy.data.objects["Camera"]
     bpy.context.scene.world = bpy.data.worlds.new("World")
-    if bpy.app.version < (5, 0):
-        bpy.context.scene.world.color = (0.1, 0.2, 0.3)
-    else:
-        background = bpy.context.scene.world.node_tree.nodes["Background"]
-        background.inputs["Color"].default_value = (0.1, 0.2, 0.3, 1.0)
+    background = tree_of(bpy.context.scene.world).nodes["Background"]
+    background.inputs["Color"].default_value = (0.1, 0.2, 0.3, 1.0)
 
 
 def make_model(model, answers):
@@ -160,19 +143,110 @@ def make_model(model, answers):
     add("Smooth", smooth)
     dress(mesh)
     bpy.ops.wm.save_as_mainfile(filepath=model)
-    # Versions before 4.0 round creases when they save.
-    bpy.ops.wm.open_mainfile(filepath=model)
     with open(answers, "w") as file:
         json.dump({name: subdivided(bpy.data.objects[name]) for name in compared}, file)
-    if bpy.app.version >= (5, 0):
-        bpy.ops.wm.usd_export(filepath=os.path.join(os.path.dirname(model), "own.usda"))
+
+
+def make_shown(model, points):
+    """What a viewport shows otherwise than a render, with an animation of three frames, and its points in a render."""
+    scene, nodes = bpy.context.scene, bpy.data.node_groups.new("Nodes", "GeometryNodeTree")
+    scene.frame_end, scene.render.use_simplify, scene.render.simplify_subdivision = 3, True, 0
+
+    def cube(name, *modifiers, parts=None):
+        thing = add(name, bpy.data.meshes.new(name), (2.5 * len(bpy.data.objects), 0, 0))
+        thing.data.from_pydata(CORNERS, [], SQUARES)
+        if parts:
+            scene.collection.objects.unlink(thing)
+            parts.objects.link(thing)
+        return thing, *(thing.modifiers.new(kind.title(), kind) for kind in modifiers)
+
+    parts, hidden = bpy.data.collections.new("Parts"), bpy.data.collections.new("Hidden")
+    scene.collection.children.link(hidden)
+    hidden.hide_render = True
+    cube("absent", parts=hidden)
+    part, subdivision = cube("part", "SUBSURF", parts=parts)
+    subdivision.render_levels = 2
+    cube("unseen")[0].hide_viewport = True
+    _, screw = cube("screw", "SCREW")
+    screw.steps, screw.render_steps = 3, 9
+    for name, kind in (("curve", "CURVE"), ("wire", "CURVE"), ("text", "FONT")):
+        curve = bpy.data.curves.new(name, kind)
+        curve.resolution_u, curve.render_resolution_u, curve.bevel_depth = 2, 5, 0.1
+        if kind == "FONT":
+            curve.body = "o"
+        else:
+            curve.splines.new("BEZIER").bezier_points.add(1)
+            curve.splines[0].bezier_points[1].co = curve.splines[0].bezier_points[1].handle_left = (1, 1, 0)
+        add(name, curve, (0, 3, 0))
+    bpy.data.objects["wire"].modifiers.new("Subdivision", "SUBSURF")
+    bpy.ops.surface.primitive_nurbs_surface_sphere_add(location=(0, 6, 0))
+    bpy.context.object.name = "spline"
+    balls = bpy.data.metaballs.new("balls")
+    balls.elements.new()
+    add("balls", balls, (3, 6, 0))
+    holder = add("holder", None, (0, 9, 0))
+    holder.instance_type, holder.instance_collection = "COLLECTION", parts
+    frame = cube("frame")[0]
+    frame.instance_type, frame.show_instancer_for_render = "VERTS", False
+    cube("child")[0].parent = frame
+    hairs = cube("emitter", "PARTICLE_SYSTEM")[1].particle_system.settings
+    hairs.type, hairs.count, hairs.render_type, hairs.instance_object = "HAIR", 5, "OBJECT", part
+    # Geometry nodes that instance a cube at three points of a line.
+    nodes.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    kinds = "GeometryNodeMeshCube", "GeometryNodeMeshLine", "GeometryNodeInstanceOnPoints", "NodeGroupOutput"
+    box, line, on_points, end = map(nodes.nodes.new, kinds)
+    line.inputs["Count"].default_value = 3
+    nodes.links.new(line.outputs[0], on_points.inputs["Points"])
+    nodes.links.new(box.outputs["Mesh"], on_points.inputs["Instance"])
+    nodes.links.new(on_points.outputs[0], end.inputs[0])
+    cube("nodes", "NODES")[1].node_group = nodes
+    cube("thick", "SUBSURF", "SOLIDIFY")
+    # What moves.
+    key, _ = cube("key", "SUBSURF")
+    key.shape_key_add(name="Basis")
+    shape = key.shape_key_add(name="Larger")
+    for point in shape.data:
+        point.co = 2 * point.co
+    camera, sun = bpy.data.cameras.new("Camera"), bpy.data.lights.new("Sun", "SUN")
+    camera.type, scene.camera = "ORTHO", add("Camera", camera, (0, -30, 0), (math.pi / 2, 0, 0))
+    sun.angle, scene.render.use_motion_blur, scene.render.motion_blur_shutter = 0.01, True, 0.5
+    add("Sun", sun).scale = (2, 2, 2)
+    for owner, name, values in (
+        (shape, "value", (0.0, 1.0)), (camera, "ortho_scale", (40.0, 60.0)), (sun, "energy", (1.0, 3.0)),
+        (holder, "location", ((0, 9, 0), (0, 9, 4))),
+    ):  # fmt: skip
+        for frame, value in zip((1, 3), values, strict=True):
+            setattr(owner, name, value)
+            owner.keyframe_insert(name, frame=frame)
+    scene.frame_set(1)
+    bpy.ops.wm.save_as_mainfile(filepath=model)
+    found = {}
+
+    class Seen(bpy.types.USDHook):
+        bl_idname, bl_label = "seen", "Points of a render"
+
+        @staticmethod
+        def on_export(context):
+            for each in context.get_depsgraph().object_instances:
+                if each.show_self and each.object.type == "MESH" and each.object.data.polygons:
+                    points = [tuple(each.matrix_world @ vertex.co) for vertex in each.object.data.vertices]
+                    found.setdefault(each.object.name, []).append(points)
+            return True
+
+    bpy.utils.expose_bundled_modules()
+    from pxr import Usd  # noqa: F401, for the context
+
+    bpy.utils.register_class(Seen)
+    bpy.ops.wm.usd_export(filepath=model + ".usda", evaluation_mode="RENDER")
+    bpy.utils.unregister_class(Seen)
+    with open(points, "w") as file:
+        json.dump(found, file)
 
 
 TEXELS = 32
 COLUMNS, DISTANCE = 4, 2.2
 SIZE = (96, 72)
 SAMPLES = 256
-EXTENSION = "MIRROR" if bpy.app.version >= (3, 5) else "EXTEND"
 
 
 def image(name, value, folder, *, is_data=False, is_float=False, is_packed=False):
@@ -257,7 +331,7 @@ def tiles(folder):
     Tile().color(ramp)
     tile = Tile()
     texcoord = tile.node("ShaderNodeTexCoord").outputs["UV"]
-    tile.color(ramp, mapping(tile.tree, texcoord, (0.2, 0.1, 0), (0, 0, 0.5), (2, 1.5, 1)), extension=EXTENSION)
+    tile.color(ramp, mapping(tile.tree, texcoord, (0.2, 0.1, 0), (0, 0, 0.5), (2, 1.5, 1)), extension="MIRROR")
     Tile().color(stripes)
     tile = Tile().color(leaf)
     tile.set("Alpha", tile.surface.inputs["Base Color"].links[0].from_node.outputs["Alpha"])
@@ -267,17 +341,29 @@ def tiles(folder):
     tile.set("Roughness", channels.outputs["Green"])
     tile.set("Metallic", channels.outputs["Blue"])
     tile = Tile(Emission_Strength=2.0, Base_Color=(0.1, 0.1, 0.1, 1.0))
-    tile.set("Emission Color" if bpy.app.version >= (4, 0) else "Emission", tile.picture(glow)["Color"])
+    tile.set("Emission Color", tile.picture(glow)["Color"])
     tile = Tile()
     turned = tile.node("ShaderNodeNormalMap")
     turned.inputs["Strength"].default_value = 0.7
     tile.tree.links.new(tile.picture(dents)["Color"], turned.inputs["Color"])
     tile.set("Normal", turned.outputs["Normal"])
     tile = Tile()
-    tile.color(ramp, tile.node("ShaderNodeUVMap", uv_map="Second").outputs["UV"])
+    product = tile.node("ShaderNodeMix", data_type="RGBA", blend_type="MULTIPLY")
+    product.inputs[0].default_value, product.inputs[7].default_value = 1.0, (0.9, 0.4, 0.6, 1.0)
+    picture = tile.picture(ramp, tile.node("ShaderNodeUVMap", uv_map="Second").outputs["UV"])
+    tile.tree.links.new(picture["Color"], product.inputs[6])
+    tile.set("Base Color", product.outputs[2])
     Tile(Alpha=0.5, Base_Color=(0.9, 0.2, 0.1, 1.0))
     tile = Tile()
     tile.color(ramp, tile.node("ShaderNodeUVMap", uv_map="Main").outputs["UV"])
+    tile = Tile()
+    colors = bpy.data.meshes[f"tile_{tile.number}"].color_attributes.new("Tint", "FLOAT_COLOR", "POINT").data
+    colors.foreach_set("color", [1.0, 0.2, 0.1, 1.0] * 2 + [0.2, 0.5, 1.0, 1.0] * 2)
+    tile.set("Base Color", tile.node("ShaderNodeVertexColor", layer_name="Tint").outputs["Color"])
+    tile = Tile()
+    emission = tile.node("ShaderNodeEmission")
+    emission.inputs["Color"].default_value = (0.2, 0.6, 0.1, 1.0)
+    tile.tree.links.new(emission.outputs[0], tile.tree.nodes["Material Output"].inputs["Surface"])
 
 
 def what_is_left_out():
@@ -285,28 +371,12 @@ def what_is_left_out():
     tile = Tile()
     thing = bpy.data.objects[f"tile_{tile.number}"]
     thing.location, thing.visible_shadow = (0, -30, 0), False
-    noise = tile.node("ShaderNodeTexNoise")
-    tile.set("Base Color", noise.outputs["Color"])
-    ramp = bpy.data.images["ramp.png"]
-    place = mapping(tile.tree, tile.node("ShaderNodeTexCoord").outputs["Object"], rotation=(0.5, 0, 0))
-    tile.set("Roughness", tile.picture(ramp, place, interpolation="Closest")["Color"])
-    bump = tile.node("ShaderNodeBump")
-    tile.tree.links.new(noise.outputs[0], bump.inputs["Height"])
-    tile.set("Normal", bump.outputs["Normal"])
-    if bpy.app.version >= (4, 0):
-        values = {"Sheen Weight": 0.3, "Coat Weight": 0.5, "Coat IOR": 1.8, "Subsurface Weight": 0.1}
-        for name, value in {**values, "Anisotropic": 0.5}.items():
-            tile.surface.inputs[name].default_value = value
+    tile.tree.links.new(
+        tile.node("ShaderNodeBsdfGlass").outputs[0], tile.tree.nodes["Material Output"].inputs["Surface"]
+    )
     lamp = bpy.data.lights.new("Lamp", "AREA")
     lamp.spread, lamp.energy = 1.0, 0.0
     add("Lamp", lamp)
-    curve = bpy.data.curves.new("Wire", "CURVE")
-    curve.splines.new("POLY").points.add(1)
-    curve.splines[0].points[1].co = (1, 0, 0, 1)
-    add("Line", curve, (0, -30, 0))
-    wire = curve.copy()
-    wire.bevel_depth = 0.1
-    add("Wire", wire, (0, -30, 0)).modifiers.new("Subdivision", "SUBSURF").render_levels = 2
 
 
 def sky(folder):
@@ -354,4 +424,4 @@ def make_look(model, picture):
 if __name__ == "__main__":
     kind, *paths = sys.argv[sys.argv.index("--") + 1 :]
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    (make_model if kind == "model" else make_look)(*paths)
+    {"model": make_model, "look": make_look, "shown": make_shown}[kind](*paths)
