@@ -135,7 +135,7 @@ def _pixels(path: str, color_space: str, needed: float, most: int | None) -> NDA
     else:
         # Mitsuba's own message about a missing file is several lines long.
         content = Path(path).read_bytes()
-    pixels = _scaled_jpeg(content, color_space, needed, most) if content.startswith(_JPEG) else None
+    pixels: NDArray | None = _scaled_jpeg(content, color_space, needed, most) if content.startswith(_JPEG) else None
     if pixels is None:
         stream = mi.MemoryStream()
         stream.write(content)
