@@ -6,7 +6,9 @@ import io
 import math
 import re
 import zipfile
+import zlib
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -133,7 +135,7 @@ def _pixels(path: str, color_space: str, needed: float, most: int | None) -> NDA
     else:
         # Mitsuba's own message about a missing file is several lines long.
         content = Path(path).read_bytes()
-    pixels = _scaled_jpeg(content, color_space, needed, most) if content.startswith(_JPEG) else None
+    pixels: NDArray | None = _scaled_jpeg(content, color_space, needed, most) if content.startswith(_JPEG) else None
     if pixels is None:
         stream = mi.MemoryStream()
         stream.write(content)
@@ -142,8 +144,20 @@ def _pixels(path: str, color_space: str, needed: float, most: int | None) -> NDA
         pixels = np.array(bitmap)
         if content.startswith(_EXR) and pixels.ndim == 3 and pixels.shape[2] >= 3:
             pixels = _in_rec_709(pixels, bitmap.pixel_format().name.startswith("XYZ"), content, color_space)
+        elif color_space == "auto" and pixels.dtype == np.uint16 and pixels.shape[2:] >= (3,) and _names_srgb(content):
+            pixels = linear_values(pixels, is_srgb=True)
     pixels = pixels[..., None] if pixels.ndim == 2 else pixels
     return reduced(pixels, needed, most, is_srgb=is_srgb_image(pixels, color_space))
+
+
+def _names_srgb(png: bytes) -> bool:
+    """Whether a PNG file has an sRGB chunk, or a colour profile of that name."""
+    header = png[: png.find(b"IDAT")]
+    profile = header.partition(b"iCCP")[2].partition(b"\0")[2][1:]
+    if profile:
+        with suppress(zlib.error):
+            header = zlib.decompressobj().decompress(profile)
+    return b"sRGB" in header or "sRGB".encode("utf-16-be") in header
 
 
 def _in_rec_709(pixels: NDArray, is_xyz: bool, content: bytes, color_space: str) -> NDArray:
@@ -183,7 +197,7 @@ def _to_xyz(chromaticities: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _scaled_jpeg(content: bytes, color_space: str, needed: float, most: int | None) -> NDArray[np.uint8] | None:
-    """A JPEG file decoded at a scale, which takes a third of the time; None if all of it is needed.
+    """A JPEG file decoded at a scale, which takes a third of the time; None if all of it is needed, unless it is CMYK.
 
     Scales are means of encoded values. Of colours in sRGB, the last halving is left to `reduced`.
     """
@@ -198,6 +212,8 @@ def _scaled_jpeg(content: bytes, color_space: str, needed: float, most: int | No
         # Mitsuba tells what is wrong.
         return None
     with opened as image:
+        if image.mode == "CMYK":
+            return np.array(image.convert("RGB"))
         is_srgb = color_space == "sRGB" or (color_space == "auto" and len(image.getbands()) >= 3)
         scale = min(1 << max(halvings(image.size, needed, most) - is_srgb, 0), _MOST_SCALE)
         if scale == 1 or image.mode not in ("L", "RGB") or any(side % scale for side in image.size):

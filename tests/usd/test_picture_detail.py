@@ -1,6 +1,8 @@
 """What a picture needs: segments, points that a camera frames, copies as one shape, and images, loaded smaller."""
 
+import struct
 import warnings
+import zlib
 from dataclasses import replace
 
 import mitsuba as mi
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 from mitsuba_subdivision.cage import Attribute, CageWarning, named_cages
 from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_subdivision.mitsuba_mesh import points_at
+from mitsuba_subdivision.srgb import decoded
 from mitsuba_subdivision.studio.cage_scenes import frame_table
 from mitsuba_subdivision.studio.picture import ERRORS, FINEST_RATE, MOST_TRIANGLES, highest_rate, outline_for
 from mitsuba_usd import copies
@@ -396,6 +399,29 @@ def test_jpeg_files_are_decoded_at_a_scale(tmp_path, channels, space):
         expected = reduced(full, needed, is_srgb=space == "auto" and channels == 3)
         assert small.shape == expected.shape
         np.testing.assert_allclose(small.astype(float), expected, rtol=0, atol=JPEG_LEVELS)
+
+
+@pytest.mark.parametrize("name", [b"sRGB", "sRGB".encode("utf-16-be"), b"Display P3", None])
+def test_sixteen_bits_are_decoded_where_the_file_names_srgb(tmp_path, name):
+    """As the rule of UsdUVTexture says: by a chunk, or by the name in the colour profile."""
+
+    def chunk(kind, data):
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    header, rows = struct.pack(">IIBBBBB", 1, 1, 16, 2, 0, 0, 0), b"\0" + struct.pack(">HHH", 0x8000, 0x8000, 0x8000)
+    profile = chunk(b"sRGB", b"\0") if name is None else chunk(b"iCCP", b"any\0\0" + zlib.compress(b"desc" + name))
+    parts = [chunk(b"IHDR", header), profile, chunk(b"IDAT", zlib.compress(rows)), chunk(b"IEND", b"")]
+    path = tmp_path / "a.png"
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(parts))
+    expected = 0x8000 if name == b"Display P3" else decoded(0x8000 / 65535)
+    np.testing.assert_allclose(read_texture_image(str(path)).pixels, np.full((1, 1, 3), expected), rtol=1e-6)
+    np.testing.assert_array_equal(read_texture_image(str(path), "raw").pixels, 0x8000)
+
+
+def test_jpeg_files_of_inks_are_colours(tmp_path):
+    path = str(tmp_path / "a.jpg")
+    pytest.importorskip("PIL.Image").new("CMYK", (8, 8), (255, 0, 0, 0)).save(path)
+    np.testing.assert_allclose(read_texture_image(path).pixels, np.broadcast_to([0, 255, 255], (8, 8, 3)), atol=2)
 
 
 def test_one_file_is_read_for_each_of_its_uses(tmp_path):
