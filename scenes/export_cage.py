@@ -306,7 +306,7 @@ def cameras(export):
         camera = UsdGeom.Camera.Define(stage, found[0] if found else prim.GetPath().AppendChild("Camera"))
         if thing == scene.camera:
             settings.CreateCameraRel().SetTargets([camera.GetPath()])
-            camera.CreateExposureAttr(math.log2(scene.cycles.film_exposure))
+            camera.CreateExposureAttr(math.log2(max(scene.cycles.film_exposure, 1e-6)))
         if data.type == "ORTHO":
             camera.CreateProjectionAttr("orthographic")
             size = 10 * data.ortho_scale  # In tenths of a unit.
