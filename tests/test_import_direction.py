@@ -2,6 +2,7 @@
 
 import re
 from graphlib import TopologicalSorter
+from importlib import import_module
 from pathlib import Path
 
 import grimp
@@ -107,9 +108,10 @@ def test_modules_do_not_import_in_circles(graph, root):
 
 
 def test_whole_usd_files_are_built_on_public_names(graph):
-    """Packages and modules beside them are public, but for names that begin with an underscore."""
+    """Packages, modules beside them and those that a package lists are public, but for names with an underscore."""
     imported = {name for _, name in imports_of(graph, WHOLE_FILES.name) if name.startswith(f"{PACKAGE}.")}
-    assert {name for name in imported if name.count(".") > 1} == set()
+    within = (name.rpartition(".") for name in imported if name.count(".") > 1)
+    assert [name for package, _, name in within if name not in import_module(package).__all__] == []
     private = re.compile(rf"from {PACKAGE}[\w.]* import (\([^)]*|.*)\b_[a-z]")
     assert [path for path in WHOLE_FILES.rglob("*.py") if private.search(path.read_text(encoding="utf-8"))] == []
 
