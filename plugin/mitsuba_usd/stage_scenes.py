@@ -40,8 +40,8 @@ _OF_CAMERA = frozenset({"camera", "picture"})
 _TRAVERSED = {"fov": "x_fov"}
 
 
-class StageScenes:
-    """Scene source of a whole stage, with the camera and the lights of the studio where it has none.
+class StageScenes(studio.SceneSource[SceneContents]):
+    """Scenes of a whole stage, with the camera and the lights of the studio where it has none.
 
     Everything may move: shapes, their control points, instances, lights and the stage's camera. Limit surfaces whose
     topology stays keep their patches and weights. Where only the camera moves, the scene stays loaded. The studio's
@@ -50,31 +50,27 @@ class StageScenes:
 
     def __init__(
         self,
-        path: str | Path,  # A USD file; for frames also the name of several, with a number in it
+        path: str | Path,
         look: studio.Look,  # Its view, size and samples
         parameters: dict[str, Any],  # Of every shape `subdivision`
         *,
         time: float | None = None,
         camera: str | None = None,  # Path of the stage's camera
-        numbers: range | None = None,  # Times or numbers of files, if there are frames
+        numbers: range | None = None,
         shutter: int | None = None,  # Sub-frames of each frame, which share its samples; see `_delays`
         # When the shutter opens and closes, in time codes after the time; by default, as its camera says
         interval: tuple[float, float] | None = None,
         over: str | Path | None = None,  # A layer that is stronger than each file
     ) -> None:
-        self.name = f'"{path}"'
-        self._shutter, self._interval, self._over = shutter, interval, over
-        self._path, self._look, self._spp, self._parameters = path, look, look.spp, parameters
-        self._time, self._camera = time, camera
-        self._has_free_rates = not is_chosen(parameters)
-        self._files = None if numbers is None else studio.FrameFiles(Path(path), numbers)
-        if shutter and self._files is not None and self._files.are_many:
+        super().__init__(path, f'"{path}"', look, time, numbers)
+        self._shutter, self._interval, self._over, self._camera = shutter, interval, over, camera
+        self._spp, self._parameters, self._has_free_rates = look.spp, parameters, not is_chosen(parameters)
+        if shutter and self._has_files:
             raise CageError(f"{self.name}: there is one file for each frame; expected times of one file for a shutter")
         self._reader: StageReader | None = None
         self._notes = StageWarnings([NO_BLUR] if shutter else [])
         self._surfaces = Surfaces()
-        # By which the scene is larger than the stage; and the stage's last contents, with those of the scene.
-        self.factor: float | None = None
+        # The last contents of the stage, and the same in the lengths of the scene.
         self._before: tuple[SceneContents, SceneContents] | None = None
         self._first: tuple[int | None, SceneContents] | None = None
         self._is_lit = False
@@ -92,10 +88,8 @@ class StageScenes:
         return contents
 
     def _read(self, number: int | None, delay: float = 0.0) -> SceneContents:
-        path, time = self._path, self._time
-        if self._files is not None and number is not None:
-            path, time = self._files.file(number), self._files.time(number)
-        if self._reader is None or (self._files is not None and self._files.are_many):
+        path, time = self._file_and_time(number)
+        if self._reader is None or self._has_files:
             require_usd(f'"{path}"')
             from .stage_walk import StageReader
 
@@ -144,15 +138,12 @@ class StageScenes:
         return [opens + (closes - opens) * (part + 0.5) / self._shutter for part in range(self._shutter)]
 
     def framing(self, contents: SceneContents) -> tuple[str, studio.View, tuple[int, int]]:
-        """Axis that points up, view and size of the picture."""
         return contents.up, angles_for(contents, self._look), size_for(contents, self._look)
 
     def points(self, contents: SceneContents) -> NDArray[np.float64]:
-        """Points ``(n, 3)`` of all shapes in the world; none if no mesh can be used."""
         return self._surfaces.points(contents)
 
     def has_studio(self, contents: SceneContents) -> bool:
-        """Whether the stage lacks a camera or lights."""
         return contents.camera is None or not contents.is_lit
 
     def remarks(self) -> list[str]:
@@ -169,7 +160,7 @@ class StageScenes:
             what = f"the studio's {' and '.join(added)} {'are' if 'lights' in added else 'is'} added"
             without = "; --no-studio renders without its lights" if "lights" in added else ""
             said.append(f"{self.name}: {' and '.join(lacking)}{dark}: {what}{without}")
-        if self._files is not None and not self._files.are_many and len(self._files.numbers) > 1 and not reader.moves:
+        if self.numbers is not None and not self._has_files and len(self.numbers) > 1 and not reader.moves:
             said.append(f"{self.name}: nothing changes with time; all frames are the same picture, but for noise")
         return said
 
@@ -280,7 +271,7 @@ class StageScenes:
         needed: dict[str, float] = {}
         if not any(material.textures() for material in first.materials):
             return needed
-        numbers = (None,) if self._files is None else self._files.numbers
+        numbers = self.numbers or (None,)
         at = (self._read(number, d) if d else self.at(number) for number, d in product(numbers, self._delays(first)))
         # Lists of shapes are the same object as long as only the camera moves.
         for _, alike in groupby(at, lambda contents: contents.shapes):

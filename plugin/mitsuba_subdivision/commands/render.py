@@ -30,11 +30,11 @@ from ..regression.scene import BOX, LoadedScene, kept_search_folders, load_scene
 from ..regression.tiers import Tolerances
 from ..shapes.parameter_table import SHADINGS
 from ..studio import AOVS, DEFAULT_VIEW, Look, sampler, variant_in_use
-from ..studio.animation import FrameRange, StillPicture, Turntable
+from ..studio.animation import FrameRange, SceneSource, StillPicture, Turntable
 from ..studio.cage_scenes import CageScenes
 from ..studio.picture import denoised, require_denoiser, shading_for, weigh_lights
 from ..studio.saving import save_scene
-from ..studio.studio_entries import LENGTHS, UP_AXES, VIEWS, Environment
+from ..studio.studio_entries import LENGTHS, UP_AXES, VIEWS
 from ..variants import set_variant, threads_set, variant_problem
 from ..whole_file import require_writable, whole_file
 from .arguments import CommandParser, above_zero, add_cage_options, add_variant, checked, finite, index, positive, seed
@@ -56,11 +56,13 @@ _OF_STAGES = ("shutter", "texture_size", "camera", "over")
 # Options that do not apply to a model's scene.
 _OF_SCENES = ("parameters", "sensor", "share", "reference", "tolerances")
 # Options that `Look` has by the same names.
-_OF_LOOK = ("up", "size", "spp", "rate", "checker", "cage", "texture_size", "environment", "transparent", "aovs")
+_OF_LOOK = ("up", "size", "spp", "rate", "checker", "cage", "texture_size", "transparent", "aovs")
 # Suffixes of files that Blender reads, and writes as USD files.
 _OF_BLENDER = (".blend", ".fbx", ".gltf", ".glb", ".abc", ".dae", ".stl", ".3ds")
 # Sub-frames of an interval.
 SUB_FRAMES = 16
+_Animation = FrameRange | Turntable | StillPicture
+_Shown = tuple[_Animation, SceneSource[Any]]
 _WITH_ALPHA = (".exr", ".png")
 # Sides of the pictures in an MP4 file are multiples of this; others lose a row or a column.
 EVEN = 2
@@ -102,9 +104,10 @@ def _shutter_of(text: str) -> Shutter:
     return Shutter(count, None if len(numbers) == 1 else (float(numbers[0]), float(numbers[1])))
 
 
-def _environment_of(text: str) -> Environment:
+def _environment_of(text: str) -> dict[str, Any]:
+    """Values of `Look` for an environment."""
     path, turn, strength = re.fullmatch(r"(.+?)(?:,turn=([^,]*))?(?:,strength=([^,]*))?", text).groups()  # type: ignore[union-attr]
-    return Environment(Path(path), float(turn or 0), float(strength or 1))
+    return {"environment": Path(path), "turn": float(turn or 0), "strength": float(strength or 1)}
 
 
 _shutter = checked(
@@ -116,7 +119,7 @@ _shutter = checked(
 )
 _environment = checked(
     _environment_of,
-    lambda given: isfinite(given.turn) and 0 <= given.strength < inf,
+    lambda given: isfinite(given["turn"]) and 0 <= given["strength"] < inf,
     "a picture, such as sky.exr or sky.exr,turn=90,strength=2",
 )
 _aovs = checked(
@@ -302,8 +305,8 @@ def _refuse_contradictions(options: argparse.Namespace, by_passes: bool) -> None
         raise ValueError(
             f'output "{options.output}" has no alpha; expected a name ending in {" or ".join(_WITH_ALPHA)}'
         )
-    if options.environment and not options.environment.path.is_file():
-        raise FileNotFoundError(f'"{options.environment.path}": there is no such file; expected a picture')
+    if options.environment and not options.environment["environment"].is_file():
+        raise FileNotFoundError(f'"{options.environment["environment"]}": there is no such file; expected a picture')
     known = (*IMAGE_SUFFIXES, *(VIDEO_SUFFIXES if has_frames else ()))
     if suffix not in known:
         more = ", or --turntable or --frames for a video" if suffix in VIDEO_SUFFIXES else ""
@@ -405,7 +408,10 @@ def _bitmap(image: NDArray[np.float32], channels: list[str], *, in_8_bits: bool)
 
 
 def _render_picture(
-    options: argparse.Namespace, scenes: Iterable[LoadedScene], spp: int | None = None, source: Any = None
+    options: argparse.Namespace,
+    scenes: Iterable[LoadedScene],
+    spp: int | None = None,
+    source: SceneSource[Any] | None = None,
 ) -> Picture:
     """Render a scene of a source, or the mean of the scenes of a frame's sub-frames, which share no samples."""
     count = _sub_frames(options)
@@ -515,16 +521,16 @@ def _frame(command: bytes, number: int) -> tuple[Picture, list[str]]:
 
 
 @lru_cache(maxsize=1)
-def _kept(command: bytes) -> tuple[argparse.Namespace, tuple[FrameRange | Turntable | StillPicture, Any]]:
+def _kept(command: bytes) -> tuple[argparse.Namespace, _Shown]:
     """Options and what they show: a worker reads it once for all of its frames."""
     options = argparse.Namespace(**pickle.loads(command))
     return options, _shown(options)
 
 
-def _shown(options: argparse.Namespace) -> tuple[FrameRange | Turntable | StillPicture, Any]:
+def _shown(options: argparse.Namespace) -> _Shown:
     """What a model's pictures show, and the scene source."""
     source = _source(options)
-    shown: FrameRange | Turntable | StillPicture
+    shown: _Animation
     if options.frames or options.shutter:
         shown = FrameRange(source, options.frames or range(1, 2))
     else:
@@ -541,7 +547,7 @@ def _shown(options: argparse.Namespace) -> tuple[FrameRange | Turntable | StillP
     return shown, source
 
 
-def _source(options: argparse.Namespace) -> Any:
+def _source(options: argparse.Namespace) -> SceneSource[Any]:
     """Scene source of one mesh, or of a whole USD file."""
     azimuth, elevation = VIEWS[options.view or DEFAULT_VIEW]
     azimuth = azimuth if options.azimuth is None else options.azimuth
@@ -551,6 +557,7 @@ def _source(options: argparse.Namespace) -> Any:
         has_studio=not options.no_studio,
         scales=True,
         **{"aovs": {}, **{name: value for name in _OF_LOOK if (value := getattr(options, name)) is not None}},
+        **(options.environment or {}),
     )
     which = {"time": options.time, "numbers": options.frames}
     if _is_stage(options):

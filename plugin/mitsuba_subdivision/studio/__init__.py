@@ -2,7 +2,7 @@
 
 from ..regression.scene import LoadedScene
 from ..tessellation import HIGHEST_RATE
-from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
+from .animation import SceneSource, StillPicture, load_quietly, set_parameters
 from .cage_scenes import frame_table, studio_scene
 from .picture import (
     ERRORS,
@@ -44,9 +44,9 @@ __all__ = [
     "MOST_SEGMENTS",
     "MOST_TRIANGLES",
     "STUDIO",
-    "FrameFiles",
     "LoadedScene",
     "Look",
+    "SceneSource",
     "StillPicture",
     "View",
     "enlargement",

@@ -26,7 +26,7 @@ from ..shapes.cage_attributes import mesh_name
 from ..surface import LimitSurface
 from ..tessellation.vertex_table import VertexTable
 from ..variants import SceneNode
-from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
+from .animation import SceneSource, StillPicture, load_quietly, set_parameters
 from .obj_materials import Material, material_bsdf, material_emitter, read_materials
 from .picture import MOST_SEGMENTS, highest_rate, outline_for, segments_for, shading_for, triangles_for
 from .studio_entries import (
@@ -73,7 +73,7 @@ class Model:
         self,
         cage: ControlCage,
         path: Path | None = None,  # Its file; None for a cage in memory
-        **chosen: Any,  # What of the file: `prim`, `time` and `scheme` as for `ControlCage.from_file`
+        **chosen: Any,  # `prim`, `time` and `scheme` as for `ControlCage.from_file`
     ) -> None:
         self.path, self.chosen = path, {name: value for name, value in chosen.items() if value is not None}
         self.cage, self.surface = cage, LimitSurface(cage, self.chosen.get("scheme"))
@@ -163,18 +163,15 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
 PosedModel = tuple[Model, NDArray[np.float64]]
 
 
-class CageScenes:
-    """Scene source of one cage in the studio: its contents at a time, and scenes of these.
+class CageScenes(SceneSource[PosedModel]):
+    """Scenes of one cage in the studio.
 
-    Where frames have the same topology, the shape that is loaded gets other control points; its patches and weights
-    stay. Each file is read once: contents of frames are kept in temporary files.
-    Raises CageError, OSError if there is no file of a frame.
+    Where frames have the same topology, the loaded shape gets other control points, and keeps its patches and weights.
+    Each file is read once: contents of frames are kept in temporary files.
     """
 
     def __init__(
         self,
-        # A cage, or the file of one. For frames, a USD file, or a name with a number in it, such as
-        # "frame_%04d.obj".
         cage: ControlCage | str | Path,
         look: Look,
         *,
@@ -182,32 +179,24 @@ class CageScenes:
         prim: str | None = None,
         time: float | None = None,
         scheme: str | None = None,
-        numbers: range | None = None,  # Times or numbers of files, if there are frames
+        numbers: range | None = None,
     ) -> None:
-        self.name = cage.source.name if isinstance(cage, ControlCage) else f'"{cage}"'
+        name = cage.source.name if isinstance(cage, ControlCage) else f'"{cage}"'
         if isinstance(cage, ControlCage) and (prim is not None or time is not None):
-            raise CageError(f"{self.name}: prim or time was given; expected them for a file")
-        self._cage, self._look = cage, look
-        # As all sources have them: types of AOVs, and the AOVs of render products.
-        self.aovs, self.products = look.aovs or {}, dict[str, list[str]]()
-        self._prim, self._time, self._scheme = prim, time, scheme
+            raise CageError(f"{name}: prim or time was given; expected them for a file")
+        super().__init__(cage, name, look, time, numbers)
+        self._cage, self._prim, self._scheme = cage, prim, scheme
         self._rules = {"scheme": scheme} if scheme else {}
-        self._files = None if numbers is None else FrameFiles(Path(str(cage)), numbers)
         # Contents and model of the first frame that is read.
         self._first: Any = None
-        # By which the scene is larger than the cage.
-        self.factor: float | None = None
         self._kept = tempfile.TemporaryDirectory()
         weakref.finalize(self, self._kept.cleanup)
 
     def at(self, number: int | None = None) -> PosedModel:
-        """The cage of a frame; by default, of the file or in memory."""
         if isinstance(self._cage, ControlCage):
             model = Model(self._cage, scheme=self._scheme)
             return model, model.cage.positions
-        path, time = Path(self._cage), self._time
-        if self._files is not None and number is not None:
-            path, time = self._files.file(number), self._files.time(number)
+        path, time = self._file_and_time(number)
         kept = Path(self._kept.name, str(number))
         is_kept = kept.exists()
         with without_warnings(), noting_warnings() as noted:
@@ -225,11 +214,9 @@ class CageScenes:
         return model, cage.positions
 
     def framing(self, contents: PosedModel) -> tuple[str, View, tuple[int, int]]:
-        """Axis that points up, view and size of the picture."""
         return self._look.up or contents[0].up, self._look.view, self._look.size or DEFAULT_SIZE
 
     def points(self, contents: PosedModel) -> NDArray[np.float64]:
-        """Points ``(n, 3)`` in the world that the camera must see: the limit surface, and the cage if it is drawn."""
         model, positions = contents
         points = model.points if positions is model.cage.positions else model.limit_points(positions)
         points = np.concatenate([points, model.wire_points(positions)]) if self._look.cage else points
@@ -237,26 +224,15 @@ class CageScenes:
             self.factor = enlargement(np.ptp(points, axis=0).max()) if self._look.scales else 1.0
         return self.factor * points
 
-    def has_studio(self, contents: PosedModel) -> bool:  # noqa: ARG002 - as all sources have it
-        """Whether the camera or the lights are those of the studio, which depend on the points: of a cage they are."""
-        return True
-
-    def remarks(self) -> list[str]:
-        """What is to be said of the pictures, as all sources have it: of a cage, nothing."""
-        return []
-
     def scene(
         self,
         contents: PosedModel,
-        # (n, 3): points that the camera must see in all frames; by default, the points of the contents
         points: NDArray[np.float64] | None = None,
         *,
-        # Whether only the scene's own sensor renders it, so that triangles may depend on the sensor
         follows_sensor: bool = False,
-        # (4, 4) each: of the scene's own sensor in all pictures of the scene, if it moves and no other one renders it
         turns: Sequence[NDArray[np.float64]] = (),  # noqa: ARG002
     ) -> SceneNode:
-        """Entries of a scene: "surface", "cage" if it is drawn, and those of the studio.
+        """Entries "surface", "cage" if it is drawn, and those of the studio.
 
         Raises CageError if ``checker`` is set, and there are no texture coordinates.
         """
@@ -275,10 +251,7 @@ class CageScenes:
     def frames(
         self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
     ) -> Iterator[LoadedScene]:
-        """The scenes of some frames; frames with the first frame's topology share one loaded scene.
-
-        Where the camera has a shutter, which a cage has not, each frame has as many scenes as sub-frames.
-        """
+        """Loaded scenes; frames with the first frame's topology share one."""
         first = self._first[1]
         scene = self.scene((first, first.cage.positions), points)
         shared: LoadedScene | None = None
@@ -299,7 +272,7 @@ class CageScenes:
         """Entries of the limit surface and of the drawn cage."""
         look = self._look
         if in_memory or model.path is None:
-            # What `prim` and `time` have chosen is in the cage itself.
+            # The cage is that of `prim` at `time`.
             cage = model.cage.as_properties(mi) | self._rules
         else:
             cage = {"filename": str(model.path.resolve()), **model.chosen}

@@ -7,7 +7,7 @@ import numbers
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -71,14 +71,6 @@ BEND, WALL = 1.6, 7.0
 GAP = 0.003
 
 
-class Environment(NamedTuple):
-    """A picture of all directions that shines, of equal angles, as USD's dome lights have."""
-
-    path: Path
-    turn: float = 0.0  # About the axis that points up, in degrees, counter-clockwise seen from above
-    strength: float = 1.0  # Factor of its radiance
-
-
 @dataclass(frozen=True)
 class Look:
     """Display options of a model or a stage."""
@@ -96,9 +88,13 @@ class Look:
     # Pixels along the sides of the textures of a stage's materials at most; None for as many as the picture shows
     texture_size: int | None = None
     transparent: bool = False  # Whether the picture has alpha and no background
-    has_studio: bool = True  # Whether lights and backdrop of the studio are added where they are missing
+    has_studio: bool = True  # Whether the studio adds missing lights, and a backdrop
     scales: bool = False  # Whether a scene is made larger by `enlargement`
-    environment: Environment | None = None  # In place of all lights and the backdrop
+    # Picture of the light from all directions, of equal angles, in place of all lights and the backdrop; its turn about
+    # the axis that points up, in degrees, counter-clockwise seen from above; and the factor of its radiance
+    environment: Path | None = None
+    turn: float = 0.0
+    strength: float = 1.0
     # Types of Mitsuba's AOVs by the names of their channels, besides those of a stage; None for no channels at all
     aovs: Mapping[str, str] | None = None
 
@@ -185,16 +181,15 @@ def studio(
 
 
 def finished(scene: SceneNode, look: Look, up: str) -> SceneNode:
-    """A scene with the environment and the AOVs of a look, without a studio or its background, as the look says."""
+    """A scene with the environment, the AOVs and the background of a look."""
     left: tuple[str, ...] = ("ground",) if look.transparent else ()
     if look.environment is not None or not look.has_studio:
         left = STUDIO
     scene = {name: entry for name, entry in scene.items() if name not in left}
     if look.environment is not None:
-        matrix = studio_axes(up) @ turned(look.environment.turn) @ studio_axes("y").T
-        to_world, name = _transform(matrix, np.zeros(3)), str(look.environment.path.resolve())
-        picture = {"filename": name, "scale": look.environment.strength, "to_world": to_world}
-        scene[ENVIRONMENT] = {"type": "envmap", **picture}
+        to_world = _transform(studio_axes(up) @ turned(look.turn) @ studio_axes("y").T, np.zeros(3))
+        picture = {"filename": str(look.environment.resolve()), "scale": look.strength}
+        scene[ENVIRONMENT] = {"type": "envmap", **picture, "to_world": to_world}
     scene = _without_background(scene) if look.transparent else scene
     aovs = ",".join(f"{name}:{kind}" for name, kind in (look.aovs or {}).items())
     return {**scene, "integrator": {"type": "aov", "aovs": aovs, "image": scene["integrator"]}} if aovs else scene
