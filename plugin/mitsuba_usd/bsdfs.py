@@ -10,37 +10,46 @@ import numpy as np
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import ArrayLike, NDArray
 
-from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
+from .contents import (
+    PLUGIN,
+    Input,
+    MaterialContents,
+    NodeContents,
+    PrimvarContents,
+    ShapeContents,
+    TextureContents,
+    leaves,
+)
 from .materialx_nodes import LUMINANCE, constant, is_all, is_constant, node, width_of
 from .stage_warnings import StageWarnings
 from .surface_models import NEUTRAL, conductor, has_white_edges, number, with_shape
 from .textures import Textures
 
-# USD's colour of meshes without one.
+# Default displayColor of USD's viewers.
 GREY = [0.5, 0.5, 0.5]
 # Width of the lobe of `principled` where clearcoat_gloss is 0, and where it is 1.
 _DULL, _GLOSSY = 0.1, 0.001
-# Above it, nearly all light is reflected.
+# Largest index of refraction; nearly all light is reflected.
 _MOST_ETA = 1000.0
 # Reflectance of the coat of `principled` at normal incidence.
 _COAT = 0.04
-# Lobes as narrow as this are mirrors: float32 has no more, and `principled` has no narrower ones.
+# Width of the narrowest lobe of `principled`, at the limit of float32; narrower lobes are mirrors.
 _MIRROR = 0.001
-# With an index of 1, `principled` leaves out metal as well.
+# With an index of 1, `principled` loses its metal.
 _LEAST_ETA = 1.001
-# Numbers beyond 0 to 1 break Mitsuba's BSDFs.
+# Inputs that Mitsuba's BSDFs need between 0 and 1.
 _FRACTIONS = ("roughness", "metalness", "transmission", "opacity")
-# Parameters of Mitsuba's own BSDFs that are no colours.
+# Textures of Mitsuba's BSDFs that are no colours.
 _RAW = ("normalmap", "bumpmap")
 # Vertices of paths through glass: in and out of a shell twice, with reflections between.
 _DEEPEST = 24
-# Where roulette may end a path. At Mitsuba's own depth of 5, pictures of the same noise take up to 8 % longer: chess
-# set, shader ball and McUsd of usd-wg/assets.
+# Depth of Russian roulette, which ends few long paths through glass that matter: pictures of the same noise take up to
+# 8 % less time than at Mitsuba's default of 5 (chess set, shader ball and McUsd of usd-wg/assets).
 _ROULETTE = 3
 
 
 def bsdf(shape: ShapeContents, textures: Textures, notes: StageWarnings) -> SceneNode:
-    """BSDF of a shape's material, which may read its attributes; without one, its display colour and opacity."""
+    """BSDF of a shape's material, or of its displayColor and displayOpacity."""
     return _Surface(shape, textures, notes).bsdf()
 
 
@@ -51,7 +60,7 @@ def heights(shape: ShapeContents, textures: Textures, notes: StageWarnings) -> t
 
 
 def radiance(material: MaterialContents, textures: Textures, notes: StageWarnings) -> SceneNode | None:
-    """What a surface emits, as a texture or a spectrum; None if it is black."""
+    """Radiance of an emissive material, as a texture or a colour; None for others."""
     emission = material.inputs.get("emission", 0.0)
     if isinstance(emission, PrimvarContents):
         notes.add("emissiveColor from a primvar is ignored", material.name)
@@ -64,19 +73,19 @@ def radiance(material: MaterialContents, textures: Textures, notes: StageWarning
 
 
 def interior(material: MaterialContents | None) -> SceneNode:
-    """Property ``interior`` of a shape: the medium that a body is filled with, if it absorbs."""
+    """Property ``interior`` of a shape: the medium of an absorbing material."""
     if material is None or not absorbs(material):
         return {}
-    # After a path of the depth, light has its colour (Beer and Lambert).
+    # Transmittance along the depth (Beer and Lambert).
     color = np.clip(constant(material.inputs["depth_color"], 3), 1e-4, 1)
     extinction = -np.log(color) / _first(material.inputs["depth"])
-    # Mitsuba takes colours up to 1, and a factor.
+    # Mitsuba's colours end at 1.
     most = max(float(extinction.max()), 1e-6)
     return {"interior": {"type": "homogeneous", "albedo": 0.0, "sigma_t": rgb(extinction / most), "scale": most}}
 
 
 def absorbs(material: MaterialContents) -> bool:
-    """Whether light fades on its way through a body of a material."""
+    """Whether the interior of a material absorbs light."""
     inputs = material.inputs
     depth, thin = inputs.get("depth", 0.0), inputs.get("thin", 0.0)
     is_deep = isinstance(depth, (int, float)) and depth > 0 and thin == 0 and "depth_color" in inputs
@@ -89,23 +98,20 @@ def integrator(
     *,
     has_clear_lamps: bool = False,  # Whether lights shine through the shapes of other lights
 ) -> SceneNode:
-    """An integrator with as long paths as glass needs, and that knows media and clear surfaces if there are any.
-
-    Roulette ends paths through glass earlier than by default, as most of the long ones carry little.
-    """
+    """An integrator with paths that are long enough for glass, of media and clear surfaces if there are any."""
     kind = "volpath" if has_clear_lamps or any(map(absorbs, materials)) else usual["type"]
-    # Mitsuba's own BSDFs may be glass.
+    # BSDFs of Mitsuba may be glass.
     if all(material.inputs.get("transmission", 0.0) == 0 and "bsdf" not in material.inputs for material in materials):
         return {**usual, "type": kind}
     return {**usual, "type": kind, "max_depth": max(usual["max_depth"], _DEEPEST), "rr_depth": _ROULETTE}
 
 
 class _Surface:
-    """Assembles the BSDF of a shape; inputs of its material as Mitsuba's textures and numbers."""
+    """Builder of the BSDF of a shape."""
 
     def __init__(self, shape: ShapeContents, textures: Textures, notes: StageWarnings) -> None:
         self._material, self._shape, self._textures, self._notes = shape.material, shape, textures, notes
-        # Plugins of Mitsuba, and parameters that they do not have.
+        # Plugins of Mitsuba with their unknown parameters.
         self._lacking: set[tuple[str, str]] = set()
         inputs = {} if shape.material is None else shape.material.inputs
         given = {name: self._for_shape(value) for name, value in inputs.items() if name != "bsdf"}
@@ -113,7 +119,7 @@ class _Surface:
         self._inputs |= {name: _clamped(self._inputs[name]) for name in _FRACTIONS}
 
     def _for_shape(self, given: Input) -> Input:
-        """An input in which constant primvars of the shape are numbers; as a whole, it may be a varying primvar."""
+        """An input with the shape's constant primvars as numbers."""
         names = {leaf.name for leaf in leaves(given) if isinstance(leaf, PrimvarContents)}
         if not names:
             return given
@@ -136,8 +142,8 @@ class _Surface:
         return rgb(np.clip(value, 0, 1))
 
     def _plugin(self, given: Input, name: str = "") -> Any:
-        """A parameter of a plugin of Mitsuba, or a plugin of its own."""
-        if isinstance(given, NodeContents) and given.is_plugin:
+        """A parameter of a plugin of Mitsuba, or the plugin itself."""
+        if isinstance(given, NodeContents) and given.type == PLUGIN:
             kept = {k: v for k, v in given.inputs.items() if k and (given.category, k) not in self._lacking}
             return {"type": given.category, **{key: self._plugin(value, key) for key, value in kept.items()}}
         if isinstance(given, list):
@@ -150,7 +156,7 @@ class _Surface:
         return given
 
     def _loadable(self, given: Input, kind: type) -> SceneNode | None:
-        """Mitsuba's own plugin of a kind, without parameters that it lacks; None if Mitsuba cannot load it."""
+        """A plugin of a kind, without unknown parameters; None if Mitsuba cannot load it."""
         entry = self._plugin(given)
         try:
             if isinstance(mi.load_dict(entry), kind):
@@ -167,7 +173,7 @@ class _Surface:
         return None
 
     def number(self, given: Input) -> SceneNode | float:
-        if isinstance(given, NodeContents) and given.is_plugin:
+        if isinstance(given, NodeContents) and given.type == PLUGIN:
             return self._loadable(given, mi.Texture) or 0.0
         value = self._for_shape(given)
         if isinstance(value, PrimvarContents):
@@ -175,7 +181,7 @@ class _Surface:
         return self._textures.number(value) if isinstance(value, (TextureContents, NodeContents)) else _first(value)
 
     def _mean(self, name: str) -> NDArray[np.float64]:
-        """An input as a number or a colour, or the mean of a picture."""
+        """A number or a colour, or the mean of an image."""
         value = self._for_shape(self._inputs[name])
         if isinstance(value, (TextureContents, NodeContents)):
             return self._textures.mean(value)
@@ -188,7 +194,7 @@ class _Surface:
         self._notes.add(what, self._shape.name if self._material is None else self._material.name)
 
     def bsdf(self) -> SceneNode:
-        """The BSDF, with its normal map and its holes."""
+        """The BSDF with its normal map and opacity."""
         if self._material is None:
             color = self._color(PrimvarContents("displayColor", GREY))
             opacity = self.number(PrimvarContents("displayOpacity", [1.0]))
@@ -210,21 +216,18 @@ class _Surface:
         return _masked(entry, self.number(self._inputs["opacity"]))
 
     def _turned(self, bsdf: SceneNode, *, is_diffuse: bool = True) -> SceneNode:
-        """A BSDF with the normal map, if there is one.
-
-        Normals that face away from the viewer are flipped, which leaves no black patches. Cycles has the shadowing
-        function for diffuse lobes only.
-        """
+        """A BSDF with the normal map, if there is one."""
         normal = self._for_shape(self._inputs.get("normal", 0.0))
         normals = self._textures.normals(normal) if isinstance(normal, (TextureContents, NodeContents)) else None
         if normals is None:
             return bsdf
+        # Normals that face away from the viewer would be black. The shadowing function is, as in Cycles, for diffuse
+        # lobes only.
         shading = {"use_shadowing_function": is_diffuse, "flip_invalid_normals": True}
         return {"type": "normalmap", "normalmap": normals, **shading, "bsdf": bsdf}
 
     def _opaque(self) -> SceneNode:
         if not self._is("translucency", 0):
-            # The same from both sides.
             return self._turned(self._sheet(0.0))
         is_bare = self._is("coat", 0) and self._is("sheen", 0)
         if is_bare and self._is("metalness", 1) and is_constant(self._inputs["base_color"]):
@@ -247,7 +250,7 @@ class _Surface:
             self._leave("edge colours of metals with textures, coats or other layers are ignored; the edges are white")
         ratio = self._ratio()
         if ratio is not None:
-            # The ratio of its widths is 1 - 0.9 anisotropic.
+            # The ratio of widths is 1 - 0.9 anisotropic.
             rest = node("invert", "float", in_=ratio, amount=1.0)
             entry["anisotropic"] = self.number(number("divide", rest, 0.9))
         if not self._is("coat", 0):
@@ -319,7 +322,7 @@ class _Surface:
         return ((eta - 1) / (eta + 1)) ** 2
 
     def _eta(self) -> float:
-        """Index of refraction of the specular layer, from outside; its colour counts by its brightness."""
+        """Index of refraction with the reflectance of the specular layer; colours count by their luminance."""
         color = np.broadcast_to(self._mean("specular_color"), (3,))
         if np.ptp(color) > 0 and not self._is("metalness", 1):
             self._leave("specularColor and specular_color only set the brightness of reflections, which are white")
@@ -356,7 +359,7 @@ class _Surface:
 
 
 def _clamped(given: Input) -> Input:
-    """A number from 0 to 1; plain pictures and attributes stay what they are."""
+    """A number from 0 to 1; plain images and primvars are kept."""
     is_plain = isinstance(given, TextureContents) and given.scale == [1.0] * 4 and given.bias == [0.0] * 4
     if is_plain or isinstance(given, PrimvarContents):
         return given

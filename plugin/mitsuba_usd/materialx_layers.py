@@ -1,10 +1,9 @@
 """MaterialX documents as layers of USD.
 
-The USD library as it is on PyPI cannot open ``.mtlx`` files. Here a document becomes a layer as OpenUSD's own plugin
-``usdMtlx`` makes it: materials are ``/MaterialX/Materials/NAME``, with a shader named by its definition, the inputs of
-which are those of the material, and with the node graphs that it reads. Layers that lead to documents are copied, and
-the copies lead to these layers instead. So USD itself composes references, variants and instances, and no layer changes
-that somebody else may have open.
+The USD library of PyPI cannot open ``.mtlx`` files. Here a document becomes a layer as in OpenUSD's plugin ``usdMtlx``:
+``/MaterialX/Materials/NAME`` with a shader that is named by its definition and reads the inputs of the material, and
+with its node graphs. Layers that refer to documents are copied, and the copies refer to these layers instead. So USD
+composes references, variants and instances, and open layers do not change.
 """
 
 from __future__ import annotations
@@ -30,20 +29,20 @@ _TYPES = {
     "matrix33": "Matrix3d", "matrix44": "Matrix4d",
 }  # fmt: skip
 
-# Files that other renderers' shaders are in are left: only definitions and graphs are read.
+# Folders with definitions and graphs, without shaders of other renderers.
 _FOLDERS = ("stdlib", "pbrlib", "bxdf", "cmlib", "nprlib")
 
 
 def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
-    """The stage, or if it refers to MaterialX documents, one of copies of its layers that has them."""
+    """The stage, or a stage of copies of its layers if they refer to MaterialX documents."""
     if Sdf.FileFormat.FindByExtension(_EXTENSION[1:]) is not None or not has_materialx():
         return stage
     identifiers: dict[str, str] = {}
-    # Kept, as nothing else holds them before the stage is open.
+    # Keeps the layers alive until the stage is open.
     layers: list[Sdf.Layer] = []
 
     def document(path: str) -> str:
-        """Identifier of the layer of a document; that of the document if it cannot be read, so that USD says so."""
+        """Identifier of the layer of a document; that of the document itself if it is unreadable, so that USD warns."""
         if path not in identifiers:
             layer = _layer_of_document(path, name)
             layers.extend([] if layer is None else [layer])
@@ -51,7 +50,7 @@ def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
         return identifiers[path]
 
     def copied(layer: Sdf.Layer) -> str:
-        """Identifier of a layer, or of its copy if it leads to documents."""
+        """Identifier of a layer, or of its copy if it refers to documents."""
         if layer.identifier in identifiers:
             return identifiers[layer.identifier]
         identifiers[layer.identifier] = layer.identifier
@@ -81,7 +80,7 @@ def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
 
 
 def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
-    """The layer of a document; None, with a note, if it cannot be read."""
+    """The layer of a document; None, with a warning, if it is unreadable."""
     import MaterialX
 
     resolved = Ar.GetResolver().Resolve(path)
@@ -100,7 +99,7 @@ def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
         MaterialX.readFromXmlString(document, text, search)
         for node in document.getMaterialNodes():
             _Material(stage, node, str(resolved))
-    # Nodes that are built of themselves cause the last one.
+    # Nodes that are built of themselves raise the last error.
     except (MaterialX.ExceptionParseError, MaterialX.Exception, OSError, UnicodeError, RecursionError) as error:
         warn(f"{name}: the MaterialX document {path} cannot be read ({str(error).strip()}); its materials are ignored")
         return None
@@ -108,14 +107,14 @@ def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
 
 
 def _beside(path: str, document: str) -> str:
-    """Path of a file that a document refers to, maybe in an archive."""
+    """Path of a file relative to a document, which may be in an archive."""
 
     def beside(file: str) -> str:
         return posixpath.normpath(posixpath.join(posixpath.dirname(file), path))
 
     if not Ar.IsPackageRelativePath(document):
         absolute = str(Ar.GetResolver().CreateIdentifier(path, Ar.ResolvedPath(document)))
-        # What is not there, as the pattern of a picture's tiles, may come back as it is.
+        # USD keeps paths of missing files, such as patterns of tiles.
         return absolute if absolute != path else beside(document)
     package, inner = Ar.SplitPackageRelativePathInner(document)
     return str(Ar.JoinPackageRelativePath([package, beside(inner)]))
@@ -137,7 +136,7 @@ class _Material:
                     material.CreateOutput(f"mtlx:{output}", _sdf_type("token")).GetAttr().AddConnection(source)
 
     def _add_shader(self, shader: MaterialX.Node, name: str) -> Sdf.Path:
-        """Add the shader of a material, whose inputs are those of the material, and return the path of its output."""
+        """Add the shader of a material, which reads the inputs of the material; return the path of its output."""
         prim = UsdShade.Shader.Define(self._stage, self._path.AppendChild(name))
         prim.CreateIdAttr(name)
         out = prim.CreateOutput("out", _sdf_type("token"))
@@ -160,7 +159,7 @@ class _Material:
             self._connect(port.GetAttr(), output, path, graph)
 
     def _add_node(self, node: MaterialX.Node, parent: Sdf.Path, container: Any) -> Sdf.Path:
-        """Add a node, and return its path. One that the document itself builds of others is a graph."""
+        """Add a node, as a graph if the document defines it by one; return its path."""
         import MaterialX
 
         path = parent.AppendChild(_prim_name(node.getName()))
@@ -189,7 +188,7 @@ class _Material:
         return port
 
     def _connect(self, attribute: Usd.Attribute, port: Any, parent: Sdf.Path, container: Any) -> bool:
-        """Connect an attribute to what a port of MaterialX reads, if it reads anything."""
+        """Connect an attribute as a port of MaterialX; return whether the port has a connection."""
         output = port.getOutputString() or "out"
         if port.hasInterfaceName():
             attribute.AddConnection(parent.AppendProperty(f"inputs:{_prim_name(port.getInterfaceName())}"))
@@ -218,8 +217,7 @@ class _Material:
         if kind == "filename":
             # Some documents repeat their file prefix in the name.
             files = [_beside(path, self._document) for path in (given.getResolvedValueString(), text)]
-            there = [path for path in files if Ar.GetResolver().Resolve(path)]
-            attribute.Set(Sdf.AssetPath((there or files)[0]))
+            attribute.Set(Sdf.AssetPath(next(filter(Ar.GetResolver().Resolve, files), files[0])))
         elif kind == "string":
             attribute.Set(text)
         elif kind in _TYPES:
@@ -235,18 +233,18 @@ def _sdf_type(kind: str) -> Sdf.ValueTypeName:
 
 
 def _prim_name(name: str) -> str:
-    """Name of a prim; MaterialX has colons for namespaces."""
+    # MaterialX has colons for namespaces.
     return name.replace(":", "__")
 
 
 def has_materialx() -> bool:
-    """Whether the package materialx is there."""
+    """Whether the package materialx is installed."""
     return importlib.util.find_spec("MaterialX") is not None
 
 
 @cache
 def library() -> MaterialX.Document:
-    """Definitions of all nodes of the standard libraries."""
+    """Document with the definitions of the standard libraries."""
     import MaterialX
 
     document = MaterialX.createDocument()
@@ -257,7 +255,7 @@ def library() -> MaterialX.Document:
 
 
 def numbers(text: str, kind: str) -> float | list[float] | str:
-    """Value of MaterialX, of a type, as numbers; what is no number is an option."""
+    """Numbers of a value of MaterialX; or its text, an option."""
     if kind == "boolean":
         return float(text == "true")
     try:

@@ -1,4 +1,4 @@
-"""Lights of UsdLux and cameras as plain data."""
+"""Lights of UsdLux, and cameras, as plain data."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .contents import CameraContents, LightContents
 from .stage_settings import namespaced
 from .stage_warnings import StageWarnings
 
-# Kind of each type, and attributes for its sizes. The schemas of lights say what they are without a value.
+# Kind of each type of light, and attributes of its size.
 _KINDS: dict[str, tuple[str, ...]] = {
     "DistantLight": ("distant", "inputs:angle"),
     "RectLight": ("rect", "inputs:width", "inputs:height"),
@@ -23,10 +23,10 @@ _KINDS: dict[str, tuple[str, ...]] = {
     "DomeLight": ("dome",),
     "DomeLight_1": ("dome",),
 }
-# Angle in degrees, of the Sun and some more, up to which a distant light becomes a point without a warning.
+# Largest angle in degrees, of the Sun and some more, of a distant light that becomes a point without a warning.
 _POINTLIKE = 1.0
 _CONE = "inputs:shaping:cone:angle"
-# Attributes of lights that are ignored, the values that have no effect, and why.
+# Ignored attributes of lights, their values without effect, and the reason.
 _EVERYWHERE = "Mitsuba's area lights shine in all directions"
 _NEUTRAL_OF_LIGHTS = {
     "inputs:diffuse": (1, "lights illuminate all materials"),
@@ -45,7 +45,7 @@ _TENTHS = 0.1
 def read_light(
     prim: Usd.Prim, to_world: NDArray[np.float64], time: Usd.TimeCode, notes: StageWarnings
 ) -> LightContents | None:
-    """Read a light with a transform ``(4, 4)`` for column vectors; None if its kind is not supported."""
+    """Read a light with a transform ``(4, 4)`` for column vectors; return None for unsupported or dark ones."""
     path, given = prim.GetPath(), str(prim.GetTypeName())
     if given not in _KINDS:
         notes.add(f"lights of type {given} are ignored; expected one of {', '.join(_KINDS)}", path)
@@ -134,12 +134,11 @@ def _texture(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> str | 
 
 def read_camera(
     camera: UsdGeom.Camera,
-    # (4, 4) float64: for column vectors. Scales are left out, as USD's own frustum of a camera has none.
-    to_world: NDArray[np.float64],
+    to_world: NDArray[np.float64],  # (4, 4) float64: for column vectors; without scales, as USD's frustums
     time: Usd.TimeCode,
     notes: StageWarnings,
 ) -> CameraContents:
-    """Read a camera. Raises TypeError, ValueError if it has no image."""
+    """Read a camera. Raises TypeError, ValueError if it is unusable."""
     prim, path = camera.GetPrim(), camera.GetPath()
     x, y, z = to_world[:3, :3].T
     forward = -z / np.linalg.norm(z)
@@ -165,7 +164,7 @@ def read_camera(
     near, far = value_at(camera.GetClippingRangeAttr(), time)
     if not near <= far:
         notes.add("a clippingRange of cameras that is not from a number to a larger one is ignored", path)
-        near, far = 1.0, 1e6  # As the schema has them
+        near, far = 1.0, 1e6  # Defaults of the schema
     focal_length, f_stop, focus = number("focalLength"), number("fStop"), number("focusDistance")
     has_lens = is_perspective and f_stop > 0 and focus > 0
     if is_perspective and f_stop > 0 >= focus:
@@ -177,10 +176,8 @@ def read_camera(
         notes.add("clippingPlanes of cameras are ignored", path)
     lens = (_TENTHS * focal_length / (2 * f_stop), focus) if has_lens else (0.0, 0.0)
     numbers = focal_length, float(near), float(far), *lens
-    if (
-        not np.isfinite([*to_world.ravel(), *film[0], *film[1], *numbers, *shutter]).all()
-        or min(*film[0], numbers[0]) <= 0
-    ):
+    is_finite = np.isfinite([*to_world.ravel(), *film[0], *film[1], *numbers, *shutter]).all()
+    if not is_finite or min(*film[0], focal_length) <= 0:
         raise ValueError("the camera has no image")
     stated = namespaced(prim, "mitsuba:sensor", time)
     return CameraContents(str(path), rigid, is_perspective, *film, *numbers, shutter, mitsuba=stated)

@@ -1,8 +1,7 @@
-"""Scenes of a whole stage: at one time, at times of its file, or of several files."""
+"""Scenes of a stage: at one time, at times of its file, or of a file for each frame."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby, product
@@ -23,8 +22,14 @@ from numpy.typing import NDArray
 
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
-from .own_parameters import with_own_parameters
-from .picture_detail import is_chosen, segments_of, texels_for_pictures, triangles_for_picture, with_rate
+from .picture_detail import (
+    is_chosen,
+    segments_of,
+    texels_for_pictures,
+    triangles_for_picture,
+    with_own_parameters,
+    with_rate,
+)
 from .scaling import scaled, scaled_camera, size_of
 from .scene_entries import LoadedShapes, Surfaces, scene_entries
 from .sensors import NO_BLUR, angles_for, sensor, size_for, with_studio_defaults
@@ -34,33 +39,31 @@ from .textures import Textures
 if TYPE_CHECKING:
     from .stage_walk import StageReader
 
-# What differs between contents where only the camera does.
+# Fields of contents that may differ between frames of one loaded scene.
 _OF_CAMERA = frozenset({"camera", "picture"})
-# Names of parameters of sensors that `mi.traverse` has others for; the field of view is along x.
+# Names of parameters of sensors in `mi.traverse`; the field of view is along x.
 _TRAVERSED = {"fov": "x_fov"}
 
 
 class StageScenes(studio.SceneSource[SceneContents]):
-    """Scenes of a whole stage, with the camera and the lights of the studio where it has none.
+    """Scenes of a whole stage, with the studio's camera and lights if it has none.
 
-    Everything may move: shapes, their control points, instances, lights and the stage's camera. Limit surfaces whose
-    topology stays keep their patches and weights. Where only the camera moves, the scene stays loaded. The studio's
-    lights are there if no frame has lights.
+    Shapes, control points, instances, lights and the camera may move. Limit surfaces with the same topology keep their
+    patches and weights; scenes in which only the camera moves stay loaded.
     """
 
     def __init__(
         self,
         path: str | Path,
-        look: studio.Look,  # Its view, size and samples
+        look: studio.Look,
         parameters: dict[str, Any],  # Of every shape `subdivision`
         *,
         time: float | None = None,
         camera: str | None = None,  # Path of the stage's camera
         numbers: range | None = None,
-        shutter: int | None = None,  # Sub-frames of each frame, which share its samples; see `_delays`
-        # When the shutter opens and closes, in time codes after the time; by default, as its camera says
-        interval: tuple[float, float] | None = None,
-        over: str | Path | None = None,  # A layer that is stronger than each file
+        shutter: int | None = None,  # Sub-frames of each frame, which share its samples
+        interval: tuple[float, float] | None = None,  # Time codes of the shutter, in place of the camera's
+        over: str | Path | None = None,  # Layer that is stronger than each file
     ) -> None:
         super().__init__(path, f'"{path}"', look, time, numbers)
         self._shutter, self._interval, self._over, self._camera = shutter, interval, over, camera
@@ -74,11 +77,11 @@ class StageScenes(studio.SceneSource[SceneContents]):
         self._before: tuple[SceneContents, SceneContents] | None = None
         self._first: tuple[int | None, SceneContents] | None = None
         self._is_lit = False
-        # Of the textures of all frames.
+        # Pixels along the sides of image files, for all frames.
         self._needed: dict[str, float] | None = None
 
     def at(self, number: int | None = None) -> SceneContents:
-        """Visible contents of a frame; by default, at the given time, where it is an error if nothing is visible."""
+        """Visible contents of a frame, or of the still picture. Raises CageError if that is empty."""
         if self._first is not None and self._first[0] == number:
             return self._first[1]
         contents = self._read(number)
@@ -114,7 +117,7 @@ class StageScenes(studio.SceneSource[SceneContents]):
         return contents
 
     def _enlarged(self, given: SceneContents) -> SceneContents:
-        """Contents with the lengths that they have in the scene; where only the camera moves, of the same shapes."""
+        """Contents in the unit of the scene; with the same shapes if only the camera moves."""
         if self.factor is None:
             self.factor = studio.enlargement(size_of(given)) if self._look.scales else 1.0
         if self.factor == 1:
@@ -147,22 +150,21 @@ class StageScenes(studio.SceneSource[SceneContents]):
         return contents.camera is None or not contents.is_lit
 
     def remarks(self) -> list[str]:
-        """Remarks on parts of the studio that are added, and on frames that are all the same."""
         contents, reader = self._first and self._first[1], self._reader
         if contents is None or reader is None:
             return []
         is_dark, has_camera = not self._is_lit and self._look.environment is None, contents.camera is not None
         lacking = ["no camera"] * (not has_camera) + ["no visible light"] * is_dark
         added = ["camera"] * (not has_camera) + ["lights"] * (is_dark and self._look.has_studio)
-        said = []
+        remarks = []
         if added:
             dark = f" ({lights})" if is_dark and (lights := reader.dark_lights()) else ""
             what = f"the studio's {' and '.join(added)} {'are' if 'lights' in added else 'is'} added"
             without = "; --no-studio renders without its lights" if "lights" in added else ""
-            said.append(f"{self.name}: {' and '.join(lacking)}{dark}: {what}{without}")
+            remarks.append(f"{self.name}: {' and '.join(lacking)}{dark}: {what}{without}")
         if self.numbers is not None and not self._has_files and len(self.numbers) > 1 and not reader.moves:
-            said.append(f"{self.name}: nothing changes with time; all frames are the same picture, but for noise")
-        return said
+            remarks.append(f"{self.name}: nothing changes with time; all frames are the same picture, but for noise")
+        return remarks
 
     @timed("Choosing triangles and textures")
     def scene(
@@ -173,7 +175,7 @@ class StageScenes(studio.SceneSource[SceneContents]):
         follows_sensor: bool = False,
         turns: Sequence[NDArray[np.float64]] = (),
     ) -> SceneNode:
-        """Entries of a scene, with polygon meshes for `with_meshes`. Raises CageError if no mesh can be used."""
+        """Entries of a scene, with polygon meshes for `with_meshes`. Raises CageError without a usable mesh."""
         parameters = self._parameters
         rest: SceneNode = {}
         chosen: dict[ShapeContents, dict[str, Any]] = {}
@@ -203,7 +205,7 @@ class StageScenes(studio.SceneSource[SceneContents]):
     def _for_picture(
         self, contents: SceneContents, sensor: SceneNode, follows_sensor: bool
     ) -> tuple[SceneContents, dict[ShapeContents, dict[str, Any]]]:
-        """Contents with copies, and parameters of limit surfaces with the triangles that a picture needs."""
+        """Contents with copies, and parameters of limit surfaces with as many triangles as a picture needs."""
         if not self._has_free_rates or not contents.has_surfaces:
             return self._with_copies(contents)[0], {}
         outline, shading = studio.outline_for(sensor), self._parameters["shading"]
@@ -218,12 +220,12 @@ class StageScenes(studio.SceneSource[SceneContents]):
         return contents, {shape: {**others, **more} for shape, more in triangles.items()}
 
     def _with_copies(self, contents: SceneContents) -> tuple[SceneContents, dict[str, Any]]:
-        """Contents with copies, and parameters of every limit surface, if the camera moves or rates are chosen."""
+        """Contents with copies, and parameters of every limit surface, for moving cameras or chosen rates."""
         if mi.Float is float:
             return contents, self._parameters
         rate = int(self._parameters.get("tessellation_rate", studio.MOST_SEGMENTS))
-        copies = Counter(shape for shape, _ in contents.placed_shapes)
-        rates = {shape: np.full(count, rate) for shape, count in copies.items() if shape.cage.scheme is not None}
+        placed = contents.placements.items()
+        rates = {shape: np.full(len(copies), rate) for shape, copies in placed if shape.cage.scheme is not None}
         shading, lowest = self._parameters.get("shading", "vertex"), 1 if self._has_free_rates else rate
         contents, joined = with_copies(contents, rates, shading, self._notes, lowest=lowest)
         if not self._has_free_rates:
@@ -233,7 +235,7 @@ class StageScenes(studio.SceneSource[SceneContents]):
     def frames(
         self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
     ) -> Iterator[studio.LoadedScene]:
-        """The scenes of some frames and sub-frames; what stays, or moves with its topology, stays loaded."""
+        """Loaded scenes of some frames and sub-frames; shapes with the same topology stay loaded."""
         self._surfaces = Surfaces()
         first = self._first[1] if self._first else self.at(numbers[0])
         shapes, parameters = LoadedShapes(), self._with_copies(first)[1]
@@ -267,13 +269,13 @@ class StageScenes(studio.SceneSource[SceneContents]):
         return sensor(contents.camera, size_for(first, self._look), contents.picture, self._look.spp, self._notes)
 
     def _texels_for_frames(self, first: SceneContents, rest: SceneNode) -> dict[str, float]:
-        """Pixels along the sides of textures that any frame shows; of all frames, so that textures do not change."""
+        """Most pixels along the sides of image files in any frame, so that textures do not change between frames."""
         needed: dict[str, float] = {}
         if not any(material.textures() for material in first.materials):
             return needed
         numbers = self.numbers or (None,)
         at = (self._read(number, d) if d else self.at(number) for number, d in product(numbers, self._delays(first)))
-        # Lists of shapes are the same object as long as only the camera moves.
+        # Lists of shapes are one object while only the camera moves.
         for _, alike in groupby(at, lambda contents: contents.shapes):
             frames = list(alike)
             seen = [self._sensor(frame, first, rest) for frame in frames]
@@ -283,9 +285,9 @@ class StageScenes(studio.SceneSource[SceneContents]):
 
 
 def _moved_sensor(loaded: studio.LoadedScene, before: SceneNode, seen: SceneNode) -> bool:
-    """Change the sensor of a scene from one entry to another; False, without any change, if that cannot be."""
+    """Change the sensor of a loaded scene from one entry to another; return False if `mi.traverse` cannot."""
     parameters = mi.traverse(loaded.sensor)
-    # Of transforms of Mitsuba, != is always False.
+    # For transforms of Mitsuba, != is always False.
     changed = {name: value for name, value in seen.items() if not eq(value, before.get(name))}
     named = {_TRAVERSED.get(name, name): value for name, value in changed.items()}
     if before.keys() != seen.keys() or not all(name in parameters for name in named):

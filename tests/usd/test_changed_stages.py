@@ -142,7 +142,7 @@ def test_cameras_by_name_intervals_of_shutters_and_frames_without_motion(tmp_pat
     for name in ("/rig/far", "far"):
         np.testing.assert_array_equal(rendered(path, "--camera", name), rendered(path, "--camera", "/rig/far"))
     assert command(path, "--camera", "near") == 1
-    assert 'there is no camera "near"; expected one of those there are: /camera, /rig/far' in capfd.readouterr().err
+    assert 'there is no camera "near"; expected one of /camera, /rig/far' in capfd.readouterr().err
     # The mean of both halves of the interval.
     blurred = rendered(path, "--time", "0.5", "--shutter", "-0.25:0.75:2")
     halves = [rendered(path, "--time", time, samples=8) for time in ("0.5", "1")]
