@@ -10,39 +10,22 @@ import numpy as np
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import ArrayLike, NDArray
 
-from .contents import (
-    PLUGIN,
-    Input,
-    MaterialContents,
-    NodeContents,
-    PrimvarContents,
-    ShapeContents,
-    TextureContents,
-    leaves,
-)
-from .materialx_nodes import LUMINANCE, constant, is_all, is_constant, node, width_of
+from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
+from .materialx_nodes import LUMINANCE, PLUGIN, constant, is_all, is_constant, node, width_of
 from .stage_warnings import StageWarnings
 from .surface_models import NEUTRAL, conductor, has_white_edges, number, with_shape
 from .textures import Textures
 
-# Default displayColor of USD's viewers.
-GREY = [0.5, 0.5, 0.5]
-# Width of the lobe of `principled` where clearcoat_gloss is 0, and where it is 1.
-_DULL, _GLOSSY = 0.1, 0.001
-# Largest index of refraction; nearly all light is reflected.
-_MOST_ETA = 1000.0
-# Reflectance of the coat of `principled` at normal incidence.
-_COAT = 0.04
-# Width of the narrowest lobe of `principled`, at the limit of float32; narrower lobes are mirrors.
-_MIRROR = 0.001
-# With an index of 1, `principled` loses its metal.
-_LEAST_ETA = 1.001
-# Inputs that Mitsuba's BSDFs need between 0 and 1.
+GREY = [0.5, 0.5, 0.5]  # Default displayColor of USD's viewers
+_DULL, _GLOSSY = 0.1, 0.001  # Width of the lobe of `principled` where clearcoat_gloss is 0, and where it is 1
+_MOST_ETA = 1000.0  # Largest index of refraction; nearly all light is reflected
+_COAT = 0.04  # Reflectance of the coat of `principled` at normal incidence
+_MIRROR = 0.001  # Width of the narrowest lobe of `principled`, at the limit of float32; narrower lobes are mirrors
+_LEAST_ETA = 1.001  # With an index of 1, `principled` loses its metal
+# Inputs that Mitsuba's BSDFs need between 0 and 1; images and primvars are as they are.
 _FRACTIONS = ("roughness", "metalness", "transmission", "opacity")
-# Textures of Mitsuba's BSDFs that are no colours.
-_RAW = ("normalmap", "bumpmap")
-# Vertices of paths through glass: in and out of a shell twice, with reflections between.
-_DEEPEST = 24
+_RAW = ("normalmap", "bumpmap")  # Textures of Mitsuba's BSDFs that are no colours
+_DEEPEST = 24  # Vertices of paths through glass: in and out of a shell twice, with reflections between
 # Depth of Russian roulette, which ends few long paths through glass that matter: pictures of the same noise take up to
 # 8 % less time than at Mitsuba's default of 5 (chess set, shader ball and McUsd of usd-wg/assets).
 _ROULETTE = 3
@@ -79,8 +62,7 @@ def interior(material: MaterialContents | None) -> SceneNode:
     # Transmittance along the depth (Beer and Lambert).
     color = np.clip(constant(material.inputs["depth_color"], 3), 1e-4, 1)
     extinction = -np.log(color) / _first(material.inputs["depth"])
-    # Mitsuba's colours end at 1.
-    most = max(float(extinction.max()), 1e-6)
+    most = max(float(extinction.max()), 1e-6)  # Mitsuba's colours end at 1
     return {"interior": {"type": "homogeneous", "albedo": 0.0, "sigma_t": rgb(extinction / most), "scale": most}}
 
 
@@ -92,13 +74,8 @@ def absorbs(material: MaterialContents) -> bool:
     return is_deep and inputs.get("transmission", 0.0) != 0 and is_constant(inputs["depth_color"])
 
 
-def integrator(
-    materials: list[MaterialContents],
-    usual: SceneNode,  # The integrator of scenes without glass
-    *,
-    has_clear_lamps: bool = False,  # Whether lights shine through the shapes of other lights
-) -> SceneNode:
-    """An integrator with paths that are long enough for glass, of media and clear surfaces if there are any."""
+def integrator(materials: list[MaterialContents], usual: SceneNode, *, has_clear_lamps: bool = False) -> SceneNode:
+    """The usual integrator, with paths that are long enough for glass, and with media and clear lamps if needed."""
     kind = "volpath" if has_clear_lamps or any(map(absorbs, materials)) else usual["type"]
     # BSDFs of Mitsuba may be glass.
     if all(material.inputs.get("transmission", 0.0) == 0 and "bsdf" not in material.inputs for material in materials):
@@ -107,16 +84,17 @@ def integrator(
 
 
 class _Surface:
-    """Builder of the BSDF of a shape."""
-
     def __init__(self, shape: ShapeContents, textures: Textures, notes: StageWarnings) -> None:
         self._material, self._shape, self._textures, self._notes = shape.material, shape, textures, notes
-        # Plugins of Mitsuba with their unknown parameters.
-        self._lacking: set[tuple[str, str]] = set()
+        self._lacking: set[tuple[str, str]] = set()  # Plugins of Mitsuba with their unknown parameters
         inputs = {} if shape.material is None else shape.material.inputs
         given = {name: self._for_shape(value) for name, value in inputs.items() if name != "bsdf"}
         self._inputs: dict[str, Input] = {**NEUTRAL, **given}
-        self._inputs |= {name: _clamped(self._inputs[name]) for name in _FRACTIONS}
+        for name in _FRACTIONS:
+            value = self._inputs[name]
+            is_plain = isinstance(value, TextureContents) and value.scale == [1.0] * 4 and value.bias == [0.0] * 4
+            if not is_plain and not isinstance(value, PrimvarContents):
+                self._inputs[name] = node("clamp", "float", in_=value, low=0.0, high=1.0)
 
     def _for_shape(self, given: Input) -> Input:
         """An input with the shape's constant primvars as numbers."""
@@ -181,7 +159,6 @@ class _Surface:
         return self._textures.number(value) if isinstance(value, (TextureContents, NodeContents)) else _first(value)
 
     def _mean(self, name: str) -> NDArray[np.float64]:
-        """A number or a colour, or the mean of an image."""
         value = self._for_shape(self._inputs[name])
         if isinstance(value, (TextureContents, NodeContents)):
             return self._textures.mean(value)
@@ -250,8 +227,7 @@ class _Surface:
             self._leave("edge colours of metals with textures, coats or other layers are ignored; the edges are white")
         ratio = self._ratio()
         if ratio is not None:
-            # The ratio of widths is 1 - 0.9 anisotropic.
-            rest = node("invert", "float", in_=ratio, amount=1.0)
+            rest = node("invert", "float", in_=ratio, amount=1.0)  # The ratio of widths is 1 - 0.9 anisotropic
             entry["anisotropic"] = self.number(number("divide", rest, 0.9))
         if not self._is("coat", 0):
             factor = self._reflectance("coat_ior") / _COAT
@@ -297,7 +273,6 @@ class _Surface:
         return {"type": "roughdielectric", "distribution": "ggx", **entry, **widths}
 
     def _sheet(self, transmission: float) -> SceneNode:
-        """A thin-walled BSDF."""
         inputs = self._inputs
         if transmission == 1 and self._widths() is None:
             color = self._color(inputs["transmission_color"])
@@ -315,7 +290,6 @@ class _Surface:
         return entry
 
     def _reflectance(self, name: str) -> float:
-        """Reflectance of an index of refraction at normal incidence."""
         eta = max(_first(self._mean(name)), 0.0)
         if not is_constant(self._inputs[name]):
             self._leave("textures of indices of refraction are replaced by their means")
@@ -356,14 +330,6 @@ class _Surface:
         root = number("power", ratio, 0.5)
         u, v = (number("min", number(category, width, root), 1.0) for category in ("divide", "multiply"))
         return {"alpha_u": self.number(u), "alpha_v": self.number(v)}
-
-
-def _clamped(given: Input) -> Input:
-    """A number from 0 to 1; plain images and primvars are kept."""
-    is_plain = isinstance(given, TextureContents) and given.scale == [1.0] * 4 and given.bias == [0.0] * 4
-    if is_plain or isinstance(given, PrimvarContents):
-        return given
-    return node("clamp", "float", in_=given, low=0.0, high=1.0)
 
 
 def _attribute(given: PrimvarContents) -> SceneNode:

@@ -17,15 +17,12 @@ if TYPE_CHECKING:
     from mitsuba_subdivision.mitsuba_mesh import CurveSet
 
 
-PLUGIN = "mitsuba"  # Type of nodes that are plugins of Mitsuba
-
-
 @dataclass(frozen=True, eq=False)
 class NodeContents:
     """A node of a shading network: a node of MaterialX, or a plugin of Mitsuba."""
 
     category: str  # Such as "multiply", see `materialx_nodes.OPERATIONS`; or the name of a plugin
-    type: str  # Type of the output: "float", "color3", "vector2" and so on; `PLUGIN` for plugins
+    type: str  # Type of the output: "float", "color3", "vector2" and so on; `materialx_nodes.PLUGIN`
     # All inputs except geometric ones; options are strings. "texcoord" has the name of a primvar, and a fallback for
     # meshes without it; if there is no fallback, other texture coordinates of the mesh serve as well.
     inputs: dict[str, Input]
@@ -193,8 +190,7 @@ class CameraContents:
     mitsuba: dict[str, Any] = field(default_factory=dict)  # Authored parameters of Mitsuba's sensor
 
 
-# Least and largest x and y of a picture, whose y points up.
-WHOLE = [0.0, 0.0, 1.0, 1.0]
+WHOLE = [0.0, 0.0, 1.0, 1.0]  # Least and largest x and y of a picture, whose y points up
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from .contents import SceneContents, ShapeContents
 from .stage_warnings import StageWarnings
 
-# Fewer instances cost less than a second in each picture.
-LEAST_INSTANCES = 64
+LEAST_INSTANCES = 64  # Fewer instances cost less than a second in each picture
 # Faces of meshes whose copies load sooner as shapes of their own than as one mesh, in a third of the memory.
 LARGE = 10_000
 # Measured memory of copies as one mesh; and its largest part of the machine's memory, and largest size.
@@ -26,6 +25,7 @@ FACE_BYTES, TRIANGLE_BYTES, POINT_BYTES = {"exact": 600, "vertex": 300}, 170, 40
 MOST_PART, MOST_BYTES = 0.75, 6e9
 # Time of a picture of instances, which grows with the square of their number.
 MEASURED_INSTANCES, MEASURED_SECONDS = 2_000, 65
+Rates = Mapping[ShapeContents, IntArray]  # Needed segments on each edge, (n,) for the placements of each shape
 
 
 def with_large_copies(contents: SceneContents) -> SceneContents:
@@ -56,12 +56,7 @@ def with_large_copies(contents: SceneContents) -> SceneContents:
 
 
 def with_copies(
-    contents: SceneContents,
-    rates: Mapping[ShapeContents, IntArray],  # (n,) int: segments on each edge for each placement
-    shading: str,
-    notes: StageWarnings,
-    *,
-    lowest: int = 1,
+    contents: SceneContents, rates: Rates, shading: str, notes: StageWarnings, lowest: int = 1
 ) -> tuple[SceneContents, dict[ShapeContents, int]]:
     """Contents where many copies of a shape are one shape for each rate that they need; and the rates of such shapes.
 
@@ -119,7 +114,7 @@ def _allowed_bytes() -> float:
     return min(MOST_BYTES, MOST_PART * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
 
 
-def _bytes(rates: Mapping[ShapeContents, IntArray], most: int, shading: str) -> float:
+def _bytes(rates: Rates, most: int, shading: str) -> float:
     """Memory of copies as one mesh, with rates up to ``most``."""
     total = 0.0
     for shape, of_copies in rates.items():
@@ -133,7 +128,6 @@ def _bytes(rates: Mapping[ShapeContents, IntArray], most: int, shading: str) -> 
 
 
 def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> ShapeContents:
-    """One shape of all copies of a shape, with the transforms ``(n, 4, 4)``."""
     cage, count = shape.cage, len(matrices)
     linear = matrices[:, :3, :3]
     positions = points_at(np.asarray(cage.positions, dtype=np.float64), matrices)

@@ -16,10 +16,8 @@ from .textures import Textures
 
 # From Mitsuba's environments, whose pole is y, to domes with the pole z.
 _POLE_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-# From Mitsuba's lights, which emit along z, to USD's, which emit along -z.
-_TURNED = np.diag([-1.0, 1, -1, 1])
-# Least softness of a cone, as Mitsuba divides by it.
-_LEAST_SOFTNESS = 1e-3
+_TURNED = np.diag([-1.0, 1, -1, 1])  # From Mitsuba's lights, which emit along z, to USD's, which emit along -z
+_LEAST_SOFTNESS = 1e-3  # Least softness of a cone, as Mitsuba divides by it
 
 
 def emitter(light: LightContents, textures: Textures) -> SceneNode:
@@ -32,8 +30,7 @@ def _distant(light: LightContents) -> SceneNode:
     angle = math.radians(min(light.size[0], 180.0))
     irradiance = np.array(light.emission)
     if angle > 0 and not light.is_normalized:
-        # Radiance times the projected solid angle.
-        irradiance = irradiance * math.pi * math.sin(angle / 2) ** 2
+        irradiance = irradiance * math.pi * math.sin(angle / 2) ** 2  # Radiance times the projected solid angle
     direction = -light.to_world[:3, 2]
     direction /= np.linalg.norm(direction)
     return {"type": "directional", "direction": direction.tolist(), "irradiance": rgb(irradiance)}

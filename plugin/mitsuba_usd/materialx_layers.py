@@ -38,8 +38,7 @@ def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
     if Sdf.FileFormat.FindByExtension(_EXTENSION[1:]) is not None or not has_materialx():
         return stage
     identifiers: dict[str, str] = {}
-    # Keeps the layers alive until the stage is open.
-    layers: list[Sdf.Layer] = []
+    layers: list[Sdf.Layer] = []  # Keeps the layers alive until the stage is open
 
     def document(path: str) -> str:
         """Identifier of the layer of a document; that of the document itself if it is unreadable, so that USD warns."""
@@ -65,8 +64,8 @@ def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
             return layer.identifier
 
         def moved(path: str) -> str:
-            is_absolute = not path or path.startswith("`")
-            return replaced.get(path) or (path if is_absolute else layer.ComputeAbsolutePath(path))
+            is_kept = not path or path.startswith("`")
+            return replaced.get(path) or (path if is_kept else layer.ComputeAbsolutePath(path))
 
         copy = Sdf.Layer.CreateAnonymous(Path(layer.GetDisplayName()).stem + ".usda")
         copy.TransferContent(layer)
@@ -108,16 +107,14 @@ def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
 
 def _beside(path: str, document: str) -> str:
     """Path of a file relative to a document, which may be in an archive."""
-
-    def beside(file: str) -> str:
-        return posixpath.normpath(posixpath.join(posixpath.dirname(file), path))
-
-    if not Ar.IsPackageRelativePath(document):
-        absolute = str(Ar.GetResolver().CreateIdentifier(path, Ar.ResolvedPath(document)))
-        # USD keeps paths of missing files, such as patterns of tiles.
-        return absolute if absolute != path else beside(document)
-    package, inner = Ar.SplitPackageRelativePathInner(document)
-    return str(Ar.JoinPackageRelativePath([package, beside(inner)]))
+    is_packed = Ar.IsPackageRelativePath(document)
+    package, inner = Ar.SplitPackageRelativePathInner(document) if is_packed else ("", document)
+    beside = posixpath.normpath(posixpath.join(posixpath.dirname(inner), path))
+    if is_packed:
+        return str(Ar.JoinPackageRelativePath([package, beside]))
+    absolute = str(Ar.GetResolver().CreateIdentifier(path, Ar.ResolvedPath(document)))
+    # USD keeps paths of missing files, such as patterns of tiles.
+    return absolute if absolute != path else beside
 
 
 class _Material:
@@ -139,12 +136,11 @@ class _Material:
         """Add the shader of a material, which reads the inputs of the material; return the path of its output."""
         prim = UsdShade.Shader.Define(self._stage, self._path.AppendChild(name))
         prim.CreateIdAttr(name)
-        out = prim.CreateOutput("out", _sdf_type("token"))
         material = UsdShade.ConnectableAPI.Get(self._stage, self._path)
         for port in shader.getInputs():
             given = self._add_input(material, port, self._path, self._source)
             prim.CreateInput(given.GetBaseName(), given.GetTypeName()).ConnectToSource(given)
-        return out.GetAttr().GetPath()
+        return prim.CreateOutput("out", _sdf_type("token")).GetAttr().GetPath()
 
     def _add_graph(
         self, graph: Any, path: Sdf.Path, inputs: Iterable[MaterialX.Input], parent: Sdf.Path, container: Any
@@ -233,8 +229,7 @@ def _sdf_type(kind: str) -> Sdf.ValueTypeName:
 
 
 def _prim_name(name: str) -> str:
-    # MaterialX has colons for namespaces.
-    return name.replace(":", "__")
+    return name.replace(":", "__")  # MaterialX has colons for namespaces
 
 
 def has_materialx() -> bool:
@@ -248,9 +243,8 @@ def library() -> MaterialX.Document:
     import MaterialX
 
     document = MaterialX.createDocument()
-    path = MaterialX.getDefaultDataSearchPath()
     folders = [f"{root}/{name}" for root in MaterialX.getDefaultDataLibraryFolders() for name in _FOLDERS]
-    MaterialX.loadLibraries(folders, path, document)
+    MaterialX.loadLibraries(folders, MaterialX.getDefaultDataSearchPath(), document)
     return document
 
 

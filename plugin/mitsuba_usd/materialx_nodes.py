@@ -23,10 +23,9 @@ Hash = NDArray[np.uint32]
 CHANNELS = {
     "boolean": 1, "integer": 1, "float": 1, "vector2": 2, "vector3": 3, "color3": 3, "vector4": 4, "color4": 4,
 }  # fmt: skip
-# Luminance of linear Rec. 709.
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-# Scales Perlin noise to about -1 to 1.
-_PERLIN_SCALE = 0.6616
+PLUGIN = "mitsuba"  # Type of nodes that are plugins of Mitsuba
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Luminance of linear Rec. 709.
+_PERLIN_SCALE = 0.6616  # Scales Perlin noise to about -1 to 1
 # Offsets of the last components of noises, single ones and sums.
 _ELSEWHERE, _ELSEWHERE_IN_SUMS = np.array([19.0, 73.0]), np.array([19.0, 193.0])
 
@@ -87,8 +86,7 @@ def operation(category: str, kind: str, inputs: Mapping[str, Any]) -> Values:
             values = np.asarray(OPERATIONS[category](arguments))
     except (IndexError, ValueError):
         raise MaterialError(f"{category} of {', '.join(inputs)} of other types") from None
-    # Shaders have no NaN.
-    return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
+    return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)  # Shaders have no NaN
 
 
 def _unit(values: Values) -> Values:
@@ -185,7 +183,6 @@ def _roughness(n: SimpleNamespace) -> Values:
 
 
 def _perlin(points: Values, width: int) -> Values:
-    """Gradient noise, of 1 to 4 components."""
     if width == 2:
         return _perlin(points, 3)[..., :2]
     if width == 4:
@@ -345,8 +342,7 @@ AFFINE: dict[str, tuple[set[str], ...]] = {
     "divide": ({"in1"},),
     "remap": ({"in"}, {"outlow", "outhigh"}),
 }
-# Categories that read texture coordinates or images.
-SAMPLED = ("texcoord", "image", "heighttonormal")
+SAMPLED = ("texcoord", "image", "heighttonormal")  # Categories that read texture coordinates or images
 
 
 def _is_affine(category: str, varying: set[str]) -> bool:
@@ -424,8 +420,7 @@ def _without_effect(category: str, kind: str, given: dict[str, Input]) -> Input 
         if isinstance(first, (int, float)) and isinstance(second, (int, float)):
             chosen = given["in1" if _COMPARED[category](first, second) else "in2"]
     if chosen is not None and is_constant(chosen) and not isinstance(chosen, str):
-        # A single number stands for all channels.
-        return _plain(constant(chosen, CHANNELS[kind]))
+        return _plain(constant(chosen, CHANNELS[kind]))  # A single number stands for all channels
     return chosen
 
 
@@ -458,8 +453,7 @@ def _picture(category: str, kind: str, given: dict[str, Input]) -> TextureConten
     if (np.count_nonzero(slopes, axis=0) != 1).any():
         return None
     if np.ptp(np.vstack([channels, values]), axis=1).max() == 0:
-        # One channel serves as a colour.
-        channels, columns = channels[:1], columns[:1]
+        channels, columns = channels[:1], columns[:1]  # One channel serves as a colour
     channel = "".join("rgba"[index] for index in channels)
     if channel not in ("r", "g", "b", "a", "rg", "rgb", "rgba"):
         return None

@@ -23,14 +23,12 @@ from .scene_entries import Surfaces
 from .stage_warnings import StageWarnings
 from .textures import Textures, samples_elsewhere
 
-# Texels for each pixel: filters see details of half a pixel, and glass magnifies.
-TEXELS_PER_PIXEL = 2.0
+TEXELS_PER_PIXEL = 2.0  # Texels for each pixel: filters see details of half a pixel, and glass magnifies
 # Quantiles of edges, a few of which may have collapsed in the texture, and of texels; and most edges that are measured.
 _MOST_EDGES, _MOST_TEXELS, _MOST_SAMPLES = 0.95, 0.99, 20_000
 # Outlines of sensors and the distances of their near planes; see `outline_for`.
 Views = Sequence[tuple[SceneNode, float]]
-# Attribute of shapes whose displacement is constant.
-_CONSTANT = "vertex_constant_displacement"
+_CONSTANT = "vertex_constant_displacement"  # Attribute of shapes whose displacement is constant
 
 
 def with_rate(parameters: dict[str, Any], contents: SceneContents) -> dict[str, Any]:
@@ -152,8 +150,7 @@ def rate_of_heights(cage: CageContents, texture: SceneNode, error: float) -> int
     """Segments on each edge whose chords are within an error of most heights of a bitmap of one channel."""
     pixels = np.array(texture["bitmap"])
     heights = pixels.reshape(pixels.shape[:2]) / (255.0 if pixels.dtype == np.uint8 else 1.0)
-    # In texels, powers of two.
-    length = 1
+    length = 1  # In texels, powers of two
     while 4 * length <= min(heights.shape):
         away = [np.abs(h[2 * length :] + h[: -2 * length] - 2 * h[length:-length]) / 2 for h in (heights, heights.T)]
         if max(np.quantile(part, _MOST_TEXELS) for part in away) > error:

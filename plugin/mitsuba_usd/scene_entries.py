@@ -43,8 +43,7 @@ from .textures import Textures
 # Faces of cages whose control points stand for the surface: a sphere with 64 around is smaller by a six-hundredth.
 DENSE = 2_000
 _NO_POINTS: NDArray[np.float64] = np.zeros((0, 3))
-# Fields of a shape that may differ between frames that share an object.
-_MOVABLE = frozenset({"cage", "to_world"})
+_MOVABLE = frozenset({"cage", "to_world"})  # Fields of a shape that may differ between frames that share an object
 
 
 def scene_entries(
@@ -59,8 +58,7 @@ def scene_entries(
 ) -> SceneNode:
     """Scene entries of a stage and the rest, with polygon meshes as `PolygonMesh`."""
     scene: SceneNode = {"type": "scene"}
-    # Keys of BSDFs without primvars, by material.
-    shared: dict[MaterialContents, str] = {}
+    shared: dict[MaterialContents, str] = {}  # Keys of BSDFs without primvars, by material
 
     def add(name: str, entry: Any) -> str:
         key = base = re.sub(r"\W", "_", name.strip("/"))
@@ -119,9 +117,8 @@ def scene_entries(
         groups.append(add(f"group_{number}", {"type": "shapegroup", **shapes}) if shapes else None)
     for instance in contents.instances:
         if groups[instance.group] is not None:
-            place = mi.ScalarTransform4f(instance.to_world.tolist())
-            group_of = {"type": "ref", "id": groups[instance.group]}
-            add(instance.name, {"type": "instance", "group": group_of, "to_world": place})
+            entry = {"type": "instance", "to_world": mi.ScalarTransform4f(instance.to_world.tolist())}
+            add(instance.name, {**entry, "group": {"type": "ref", "id": groups[instance.group]}})
     # The integrator volpath, or a dome, finds lights behind clear shapes of other lights.
     has_dome = any(light.kind == "dome" for light in contents.lights)
     are_clear = has_dome or (bool(rest) and rest["integrator"]["type"] == "volpath")
@@ -138,8 +135,7 @@ class Surfaces:
         self._known: dict[tuple[int, ...], list[tuple[CageContents, LimitSurface]]] = {}
         # By names of shape and material, for frames with other control points.
         self._of_shape: dict[tuple[str, str | None], tuple[CageContents, LimitSurface]] = {}
-        # Warnings about the cages of surfaces.
-        self.messages: dict[LimitSurface, list[str]] = {}
+        self.messages: dict[LimitSurface, list[str]] = {}  # Warnings about the cages of surfaces
         # Properties of the shape `subdivision` for a cage.
         self.properties = cache(lambda surface: surface.cage.as_properties(mi))
         self._sampling = cache(_sampling)
@@ -176,11 +172,9 @@ class Surfaces:
             try:
                 self._of_shape[key] = cage, self.of(cage)
             except SchemeError:
-                # Shown as polygons.
-                return points_at(cage.positions, shape.to_world)
+                return points_at(cage.positions, shape.to_world)  # Shown as polygons
             except CageError:
-                # Its entry issues the error.
-                return _NO_POINTS
+                return _NO_POINTS  # Its entry issues the error
         sampled = self._sampling(self._of_shape[key][1])(np.asarray(cage.positions, dtype=np.float64))
         return points_at(sampled, shape.to_world)
 
@@ -205,8 +199,7 @@ def subdivision(
     notes: StageWarnings,
 ) -> SceneNode:
     """A limit surface. Raises CageError for an invalid cage, SchemeError if the scheme cannot subdivide it."""
-    # Validated here, so that messages name the prim.
-    surface = surfaces.of(shape.cage)
+    surface = surfaces.of(shape.cage)  # Validated here, so that messages name the prim
     for message in surfaces.messages[surface]:
         notes.add_message(message.replace(surface.cage.source.name, shape.cage.source.name), shape.name)
     tensor: Any = mi.TensorXu  # The stubs call it an object
@@ -244,7 +237,7 @@ def as_polygons(shape: ShapeContents) -> ShapeContents:
 
 
 def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
-    """Triangles of a shape that is not to be subdivided."""
+    """Triangles of a polygon mesh."""
     cage, normals = shape.cage, shape.normals
     corners, face = triangle_corners(cage.positions, cage.face_sizes, cage.face_vertices)
     corners = corners[~np.isin(face, cage.holes)]
@@ -252,8 +245,7 @@ def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
     if cage.texcoords is not None:
         data["texcoords"] = cage.texcoords
     if normals is not None or any(attribute.interpolation == "face_varying" for attribute in data.values()):
-        # Every corner of a face is a vertex of its own.
-        vertex, triangles = cage.face_vertices, corners
+        vertex, triangles = cage.face_vertices, corners  # Every corner of a face is a vertex of its own
     else:
         vertex, triangles = np.arange(len(cage.positions)), cage.face_vertices[corners]
     matrix = shape.to_world
@@ -285,12 +277,12 @@ class LoadedShapes:
         self._bsdfs = [pair for pair in self._bsdfs if pair[0] in materials]
 
     def object_of(
-        self,
-        shape: ShapeContents,
-        entry: Callable[[SceneNode], SceneNode],  # Makes the entry of the shape with a BSDF
-        bsdf: Callable[[], SceneNode],  # Makes the entry of its BSDF
+        self, shape: ShapeContents, entry: Callable[[SceneNode], SceneNode], bsdf: Callable[[], SceneNode]
     ) -> mi.Object:
-        """The object of a shape. Raises CageError, SchemeError as `subdivision` does."""
+        """The object of a shape, from functions that return its entry with a BSDF, and the entry of the BSDF.
+
+        Raises CageError, SchemeError as `subdivision` does.
+        """
         # Parts of a mesh with several materials, and equal shapes of groups, share a name.
         self._counts[shape.name] += 1
         key = shape.name, self._counts[shape.name]
@@ -306,7 +298,8 @@ class LoadedShapes:
             or not same_topology(known[0].cage, shape.cage)
             or (shape.cage.scheme is None and not is_there)
         ):
-            known = shape, self._loaded(shape.material, entry, bsdf)
+            # The cage is validated before the BSDF is made, so that warnings name the prim.
+            known = shape, self._loaded(shape.material, entry({}), bsdf)
         elif not is_there:
             positions = np.asarray(shape.cage.positions, dtype=np.float64)
             if not np.isfinite(positions).all():
@@ -317,11 +310,7 @@ class LoadedShapes:
         self._now[key] = known
         return known[1]
 
-    def _loaded(
-        self, material: MaterialContents | None, entry: Callable[[SceneNode], SceneNode], bsdf: Callable[[], SceneNode]
-    ) -> mi.Object:
-        # The cage is validated before the BSDF is made, so that warnings name the prim.
-        made = entry({})
+    def _loaded(self, material: MaterialContents | None, made: SceneNode, bsdf: Callable[[], SceneNode]) -> mi.Object:
         # Shapes of a material without primvars share its BSDF.
         shared = None if material is None or material.primvars() else material
         loaded = next((loaded for known, loaded in self._bsdfs if same(known, shared)), None)

@@ -20,8 +20,7 @@ NO_BLUR = "shutters of cameras have no effect without the option --shutter of re
 # Default width of pictures by a stage's camera, in pixels.
 WIDTH = 640
 RESERVED = ("integrator", "sensor", *STUDIO, ENVIRONMENT)
-# Minimum half-extent of the framed content, relative to its position.
-_LEAST_SIZE = 1e-6
+_LEAST_SIZE = 1e-6  # Minimum half-extent of the framed content, relative to its position
 
 
 def sensor(
@@ -71,8 +70,7 @@ def _sensor(camera: CameraContents, size: tuple[int, int], spp: int | None, note
         return {"type": "orthographic", "to_world": mi.ScalarTransform4f(matrix.tolist()), **common}
     common["to_world"] = mi.ScalarTransform4f((camera.to_world @ np.diag([-1.0, 1, -1, 1])).tolist())
     if camera.lens_radius == 0:
-        # As parts of the film's sides, y down.
-        x, y = camera.offset[0] / wide, -camera.offset[1] / high
+        x, y = camera.offset[0] / wide, -camera.offset[1] / high  # As parts of the film's sides, y down
         offset = {"principal_point_offset_x": x, "principal_point_offset_y": y} if x or y else {}
         return {"type": "perspective", **offset, **common, **_field_of_view(wide, camera)}
     # A thin lens has no principal point: the film is a window of a larger one with its middle on the axis.
@@ -127,14 +125,9 @@ def angles_for(contents: SceneContents, look: Look) -> View:
 
 
 def with_studio_defaults(
-    contents: SceneContents,
-    points: NDArray[np.float64],  # (n, 3) float64: framed points in the world
-    is_lit: bool,  # Whether the stage has lights
-    look: Look,
-    notes: StageWarnings,
-    name: str,  # With which messages begin
+    contents: SceneContents, points: NDArray[np.float64], is_lit: bool, look: Look, notes: StageWarnings, name: str
 ) -> SceneNode:
-    """Entries of the integrator and the sensor, and of the studio's parts that the stage lacks."""
+    """Entries of the integrator and the sensor, and of the studio's parts that the stage lacks, around points."""
     camera, size = contents.camera, size_for(contents, look)
     bounds = np.stack([points.min(axis=0), points.max(axis=0)])
     if (bounds[0] == bounds[1]).all():
@@ -161,7 +154,6 @@ def with_studio_defaults(
 
 
 def _distant_light(light: SceneNode, target: NDArray[np.float64]) -> SceneNode:
-    """A distant light with the irradiance of a rectangle light at its target."""
     matrix = np.array(light["to_world"].matrix, dtype=np.float64)
     towards = target - matrix[:3, 3]
     distance = np.linalg.norm(towards)

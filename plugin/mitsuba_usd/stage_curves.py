@@ -26,8 +26,7 @@ BASES: dict[str, NDArray[np.float64]] = {
 }
 # Sine of the largest angle between tubes without a gap, and largest ratio of lengths of uniform transforms.
 _STRAIGHT, _EVEN = 1e-3, 1.001
-# Parameters along each segment at which colours are sampled.
-_PLACES = (np.arange(8)[:, None] + 0.5) / 8
+_PLACES = (np.arange(8)[:, None] + 0.5) / 8  # Parameters along each segment at which colours are sampled
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +76,6 @@ class CurveTopology:
         return powers
 
     def _controls(self, values: NDArray[np.float64], index: IntArray) -> NDArray[np.float64]:
-        """Control values of segments, by indices ``(n_s, 2 or 4)`` within their curves."""
         first, last = ragged.starts(self.counts)[self._curve, None], self.counts[self._curve, None] - 1
         if self.wrap == "periodic":
             return values[first + index % (last + 1)]

@@ -38,8 +38,7 @@ _NEUTRAL_OF_LIGHTS = {
 }
 _NEUTRAL_EXPOSURE = {"exposure": 0.0, "exposure:iso": 100.0}
 _NEUTRAL_EXPOSURE |= dict.fromkeys(("exposure:time", "exposure:fStop", "exposure:responsivity"), 1.0)
-# Apertures and focal lengths are in tenths of the world's unit.
-_TENTHS = 0.1
+_TENTHS = 0.1  # Apertures and focal lengths are in tenths of the world's unit
 
 
 def read_light(
@@ -133,12 +132,10 @@ def _texture(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> str | 
 
 
 def read_camera(
-    camera: UsdGeom.Camera,
-    to_world: NDArray[np.float64],  # (4, 4) float64: for column vectors; without scales, as USD's frustums
-    time: Usd.TimeCode,
-    notes: StageWarnings,
+    camera: UsdGeom.Camera, to_world: NDArray[np.float64], time: Usd.TimeCode, notes: StageWarnings
 ) -> CameraContents:
-    """Read a camera. Raises TypeError, ValueError if it is unusable."""
+    """Read a camera with a transform ``(4, 4)`` for column vectors. Raises TypeError, ValueError if it is unusable."""
+    # Frustums of USD have no scale.
     prim, path = camera.GetPrim(), camera.GetPath()
     x, y, z = to_world[:3, :3].T
     forward = -z / np.linalg.norm(z)

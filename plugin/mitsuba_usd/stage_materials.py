@@ -14,16 +14,7 @@ from pxr import Sdf, Usd, UsdShade
 
 from . import materialx_nodes as nodes
 from . import surface_models
-from .contents import (
-    PLUGIN,
-    Input,
-    MaterialContents,
-    MaterialError,
-    NodeContents,
-    PrimvarContents,
-    TextureContents,
-    leaves,
-)
+from .contents import Input, MaterialContents, MaterialError, NodeContents, PrimvarContents, TextureContents, leaves
 from .materialx_layers import has_materialx, library, numbers
 from .stage_warnings import StageWarnings
 from .surface_models import LEFT_OUT, MODELS, PREVIEW
@@ -44,8 +35,7 @@ def _texcoords(name: str, fallback: Input | None = None) -> NodeContents:
 
 
 _PREVIEW_SURFACE = "UsdPreviewSurface"
-# Prefix of the identifiers of Mitsuba's plugins.
-_PLUGIN = "mitsuba_"
+_PLUGIN = "mitsuba_"  # Prefix of the identifiers of Mitsuba's plugins
 # Render contexts of the outputs of a material, the preferred first; "" is the universal one.
 _CONTEXTS = ("mitsuba", "mtlx", "")
 _PREVIEW_PORTS: _Ports = {name: ("string" if name == "opacityMode" else "", value) for name, value in PREVIEW.items()}
@@ -141,8 +131,7 @@ class MaterialReader:
         heights = self._displacement(material)
         if model == _PLUGIN:
             return MaterialContents(str(path), {**inputs, **heights})
-        names = [name for name in LEFT_OUT[model] if not nodes.is_all(inputs.get(name, 0.0), 0)]
-        if names:
+        if names := [name for name in LEFT_OUT[model] if not nodes.is_all(inputs.get(name, 0.0), 0)]:
             self._notes.add(f"inputs of {model} that Mitsuba's BSDFs lack are ignored", f"{', '.join(names)} of {path}")
         if any(inputs.get(name, 0.0) != 0 for name in ("subsurface", "subsurface_weight")):
             self._notes.add("subsurface scattering is rendered as diffuse reflection of its colour", path)
@@ -153,7 +142,6 @@ class MaterialReader:
         return replace(contents, inputs={**contents.inputs, **heights})
 
     def _displacement(self, material: UsdShade.Material) -> dict[str, Input]:
-        """Inputs "displacement" and "displacement_scale" of a material with a displacement."""
         contexts = _contexts(material.GetDisplacementOutputs())
         context = next((name for name in _CONTEXTS if name in contexts), "")
         shader, output, _ = material.ComputeDisplacementSource(context)
@@ -167,9 +155,9 @@ class MaterialReader:
         else:
             heights = self._output(shader, output)
         heights, scale = 0.0 if heights is None else heights, 1.0 if scale is None else scale
-        if not isinstance(heights, PrimvarContents):
-            return {"displacement": surface_models.number("multiply", heights, scale)}
-        return {"displacement": heights, "displacement_scale": float(nodes.constant(scale)[0])}
+        if isinstance(heights, PrimvarContents):
+            return {"displacement": heights, "displacement_scale": float(nodes.constant(scale)[0])}
+        return {"displacement": surface_models.number("multiply", heights, scale)}
 
     def _surface(self, shader: UsdShade.Shader) -> tuple[str, dict[str, Input]] | None:
         """Model of a surface shader, and all its inputs except geometric ones; None if the model is unknown."""
@@ -191,11 +179,10 @@ class MaterialReader:
         return (model, inputs) if model in MODELS else None
 
     def _ports(self, definition: MaterialX.NodeDef) -> _Ports:
-        return {d.getName(): (d.getType(), self._default(d)) for d in definition.getActiveInputs()}
+        return {d.getName(): (d.getType(), _default(d)) for d in definition.getActiveInputs()}
 
     def _inputs(self, shader: UsdShade.Shader, ports: _Ports) -> _Inputs:
-        names = sorted({given.GetBaseName() for given in shader.GetInputs()} - ports.keys())
-        if names:
+        if names := sorted({given.GetBaseName() for given in shader.GetInputs()} - ports.keys()):
             what = f"inputs that {shader.GetShaderId()} does not have are ignored"
             self._notes.add(what, f"{', '.join(names)} of {shader.GetPath()}")
         return {name: self._input(shader, name, kind, default) for name, (kind, default) in ports.items()}
@@ -248,21 +235,13 @@ class MaterialReader:
             self._notes.add(what, attribute.GetPath())
         return _IS_SRGB.get(space, False)
 
-    def _default(self, declared: MaterialX.Input) -> Input | None:
-        geometry = declared.getDefaultGeomPropString()
-        if geometry:
-            return _texcoords("st") if geometry == "UV0" else None
-        text = declared.getValueString()
-        return numbers(text, declared.getType()) if text or declared.getType() in ("string", "filename") else None
-
     def _output(self, shader: UsdShade.Shader, output: str) -> Input | None:
         """Expression of a shader's output, read once; None if the shader is unknown."""
         key = str(shader.GetPath()), output
         if key not in self._known:
             if self._depth > _DEEPEST:
                 raise MaterialError(f"more than {_DEEPEST} shaders in a row")
-            # The value of a cycle.
-            self._known[key] = 0.0
+            self._known[key] = 0.0  # The value of a cycle
             self._depth += 1
             try:
                 self._known[key] = self._computed(shader, output)
@@ -316,14 +295,14 @@ class MaterialReader:
                 value = (numbers.T[:3, :3] if numbers.ndim == 2 else numbers).ravel().tolist()
             parameters |= {} if value is None else {key: value}
         if name not in ("bitmap", "checkerboard"):
-            return NodeContents(name, PLUGIN, parameters)
+            return NodeContents(name, nodes.PLUGIN, parameters)
         matrix: Any = parameters.pop("to_uv", np.eye(3).ravel().tolist())
         if np.size(matrix) != 9:
             raise MaterialError(f"to_uv of {path} is no matrix")
         to_uv = np.reshape(matrix, (3, 3)) @ V_DOWN
         if name == "checkerboard":
             placed: dict[str, Input] = {"to_uv": to_uv.ravel().tolist(), "": _texcoords("st")}
-            return NodeContents(name, PLUGIN, {**parameters, **placed})
+            return NodeContents(name, nodes.PLUGIN, {**parameters, **placed})
         file, wrap = (str(parameters.pop(key, usual)) for key, usual in (("filename", ""), ("wrap_mode", "repeat")))
         space = "raw" if parameters.pop("raw", False) else "auto"
         if parameters:
@@ -350,7 +329,6 @@ class MaterialReader:
         return self._placed(picture, "color3" if output == "rgb" else "float", given["st"])
 
     def _wrap(self, given: dict[str, Any], names: tuple[str, str], prim: object) -> str:
-        """Wrap mode of Mitsuba, by the inputs along u and v."""
         modes = []
         for name in names:
             mode = str(given.get(name))
@@ -450,7 +428,6 @@ class MaterialReader:
         return replace(picture, to_uv=to_uv, texcoords=sets[0] if sets else picture.texcoords)
 
     def _primvar(self, kind: str, given: _Inputs, prim: object) -> Input:
-        """A primvar, or texture coordinates if it has two channels."""
         name, fallback = str(given["geomprop"]), given.get("default")
         if kind == "vector2":
             if fallback is not None and not nodes.is_constant(fallback):
@@ -481,8 +458,14 @@ _SPECIAL: dict[str, Callable[[MaterialReader, str, _Inputs, object], Input | Non
 }
 
 
+def _default(declared: MaterialX.Input) -> Input | None:
+    if geometry := declared.getDefaultGeomPropString():
+        return _texcoords("st") if geometry == "UV0" else None
+    text, kind = declared.getValueString(), declared.getType()
+    return numbers(text, kind) if text or kind in ("string", "filename") else None
+
+
 def _contexts(outputs: list[UsdShade.Output]) -> list[str]:
-    """Render contexts of connected outputs."""
     return [output.GetBaseName().rpartition(":")[0] for output in outputs if output.HasConnectedSource()]
 
 

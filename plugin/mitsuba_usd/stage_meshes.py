@@ -22,12 +22,9 @@ from .stage_lights_and_camera import read_emission
 from .stage_materials import MaterialReader
 from .stage_warnings import StageWarnings
 
-# Primvars for the colour of meshes without a material.
-COLORS = ("displayColor", "displayOpacity")
-# Most faces times parts of a mesh whose parts each evaluate the whole surface.
-MOST_SHARED_FACES = 1_000_000
-# Segments of spheres and the like: of a circle around the axis, and of half a circle along it.
-AROUND, ALONG = 64, 24
+COLORS = ("displayColor", "displayOpacity")  # Primvars for the colour of meshes without a material
+MOST_SHARED_FACES = 1_000_000  # Most faces times parts of a mesh whose parts each evaluate the whole surface
+AROUND, ALONG = 64, 24  # Segments of spheres and the like: of a circle around the axis, and of half a circle along it
 # Even permutations of the coordinates that take z to an axis.
 _TURNS = {"X": (2, 0, 1), "Y": (1, 2, 0), "Z": (0, 1, 2)}
 _NO_FACES: IntArray = np.zeros(0, np.int64)
@@ -44,7 +41,8 @@ class ShapeReader:
 
     def read(self, prim: Usd.Prim, to_world: NDArray[np.float64]) -> list[ShapeContents]:
         """Shapes of a prim with a transform ``(4, 4)`` for column vectors, one for each material."""
-        location = f"{self._name}, prim {shortened(str(prim.GetPath()))}"
+        path = str(prim.GetPath())
+        location = f"{self._name}, prim {shortened(path)}"
         if not are_invertible(to_world):
             raise CageError(f"{location}: the transform to world space is not invertible; expected one that is")
         with np.errstate(over="ignore", invalid="ignore"):
@@ -58,9 +56,9 @@ class ShapeReader:
                     what = "textures of curves are looked up around them, and along all curves of a prim"
                     self._notes.add(what, prim.GetPath())
                 cage, curves = read_curves(prim, to_world, self._time, names, self._notes)
-                return [replace(self._shape(prim, to_world, cage, None, material), curves=curves)]
+                return [self._completed(prim, ShapeContents(path, cage, to_world, None, material, curves=curves))]
             cage, normals = read_gprim(prim, self._time)
-            return [self._shape(prim, to_world, cage, normals, material)]
+            return [self._completed(prim, ShapeContents(path, cage, to_world, normals, material))]
 
     def _parts(self, prim: Usd.Prim, to_world: NDArray[np.float64], location: str) -> list[ShapeContents]:
         mesh = UsdGeom.Mesh(prim)
@@ -93,8 +91,8 @@ class ShapeReader:
                     shown = np.flatnonzero(owner == number)
                 else:
                     cage = replace(cage, holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
-            shape = self._shape(prim, to_world, cage, normals, material)
-            shapes.append(replace(shape, shown_faces=shown, rate=rate))
+            shape = ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, shown_faces=shown, rate=rate)
+            shapes.append(self._completed(prim, shape))
         return shapes
 
     def _materials_of_faces(
@@ -127,14 +125,9 @@ class ShapeReader:
             self._notes.add(what, material.name)
         return tuple(sorted(material.primvars())), next(iter(names), None)
 
-    def _shape(
-        self,
-        prim: Usd.Prim,
-        to_world: NDArray[np.float64],
-        cage: CageContents,
-        normals: NDArray[np.float64] | None,
-        material: MaterialContents | None,
-    ) -> ShapeContents:
+    def _completed(self, prim: Usd.Prim, shape: ShapeContents) -> ShapeContents:
+        """A shape with its texture coordinates, constant primvars and emission."""
+        cage, material = shape.cage, shape.material
         for name, fallback in [] if material is None else [*material.texcoords().items()][:1]:
             cage = self._with_texcoords(prim, cage, name, fallback)
         names = COLORS if material is None else material.primvars()
@@ -147,7 +140,7 @@ class ShapeReader:
             if not np.isfinite(radiance).all():
                 self._notes.add("mesh lights with numbers that are not finite are ignored", prim.GetPath())
                 radiance = None
-        return ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, constants, radiance, is_normalized)
+        return replace(shape, cage=cage, constants=constants, radiance=radiance, is_normalized=is_normalized)
 
     def _with_texcoords(self, prim: Usd.Prim, cage: CageContents, name: str, fallback: Input | None) -> CageContents:
         """A cage with the named texture coordinates, or else with others of its own or the fallback."""
@@ -211,8 +204,7 @@ def read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[CageContents, NDArra
         half = np.array([number("width"), number("length"), 0.0]) / 2
         points, vertices = half * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.arange(4)
         if axis != "Z":
-            # The width is along x or z, never along y.
-            points, vertices = points[:, [1, 0, 2]], vertices[::-1]
+            points, vertices = points[:, [1, 0, 2]], vertices[::-1]  # The width is along x or z, never along y
     else:
         height = number("height") if prim.HasAttribute("height") else 0.0
         points, normals, vertices = _revolved(_OUTLINES[kind](number("radius"), height / 2))
@@ -225,8 +217,7 @@ def _arc(radius: float, start: float, end: float, height: float) -> Line:
     angle = np.radians(np.linspace(start, end, ALONG + 1))
     normals = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     points = radius * normals + [0, height]
-    # On the axis, exactly.
-    points[np.abs(normals[:, 0]) < 1e-12, 0] = 0
+    points[np.abs(normals[:, 0]) < 1e-12, 0] = 0  # On the axis, exactly
     return points, normals
 
 

@@ -39,10 +39,8 @@ from .textures import Textures
 if TYPE_CHECKING:
     from .stage_walk import StageReader
 
-# Fields of contents that may differ between frames of one loaded scene.
-_OF_CAMERA = frozenset({"camera", "picture"})
-# Names of parameters of sensors in `mi.traverse`; the field of view is along x.
-_TRAVERSED = {"fov": "x_fov"}
+_OF_CAMERA = frozenset({"camera", "picture"})  # Fields of contents that may differ between frames of one loaded scene
+_TRAVERSED = {"fov": "x_fov"}  # Names of parameters of sensors in `mi.traverse`; the field of view is along x
 
 
 class StageScenes(studio.SceneSource[SceneContents]):
@@ -77,8 +75,7 @@ class StageScenes(studio.SceneSource[SceneContents]):
         self._before: tuple[SceneContents, SceneContents] | None = None
         self._first: tuple[int | None, SceneContents] | None = None
         self._is_lit = False
-        # Pixels along the sides of image files, for all frames.
-        self._needed: dict[str, float] | None = None
+        self._needed: dict[str, float] | None = None  # Pixels along the sides of image files, for all frames
 
     def at(self, number: int | None = None) -> SceneContents:
         """Visible contents of a frame, or of the still picture. Raises CageError if that is empty."""
@@ -106,8 +103,7 @@ class StageScenes(studio.SceneSource[SceneContents]):
             contents = replace(contents, lights=[], shapes=dark if shines else contents.shapes)
         self._parameters = with_rate(self._parameters, contents)
         if contents.has_surfaces:
-            shading = studio.shading_for(studio.variant_in_use(), self._parameters)
-            self._parameters = {**self._parameters, "shading": shading}
+            self._parameters = {**self._parameters, "shading": studio.shading_for(self._parameters)}
         self._is_lit |= contents.is_lit
         look, picture = self._look, contents.picture
         spp = (picture.spp or studio.DEFAULT_SPP) if self._spp is None else self._spp
@@ -205,7 +201,6 @@ class StageScenes(studio.SceneSource[SceneContents]):
     def _for_picture(
         self, contents: SceneContents, sensor: SceneNode, follows_sensor: bool
     ) -> tuple[SceneContents, dict[ShapeContents, dict[str, Any]]]:
-        """Contents with copies, and parameters of limit surfaces with as many triangles as a picture needs."""
         if not self._has_free_rates or not contents.has_surfaces:
             return self._with_copies(contents)[0], {}
         outline, shading = studio.outline_for(sensor), self._parameters["shading"]
@@ -220,7 +215,6 @@ class StageScenes(studio.SceneSource[SceneContents]):
         return contents, {shape: {**others, **more} for shape, more in triangles.items()}
 
     def _with_copies(self, contents: SceneContents) -> tuple[SceneContents, dict[str, Any]]:
-        """Contents with copies, and parameters of every limit surface, for moving cameras or chosen rates."""
         if mi.Float is float:
             return contents, self._parameters
         rate = int(self._parameters.get("tessellation_rate", studio.MOST_SEGMENTS))

@@ -23,8 +23,7 @@ _NEUTRAL: dict[str, list[Any]] = {
     "materialBindingPurposes": [["full", ""], ["full", "preview"]],
     "renderingColorSpace": ["", "lin_rec709", "lin_rec709_scene"],
 }
-# Gaffer's name of this setting of Cycles.
-_TRANSPARENT = "cycles:background:transparent"
+_TRANSPARENT = "cycles:background:transparent"  # Gaffer's name of this setting of Cycles
 # Values of aspectRatioConformPolicy; the first is the default.
 _CONFORM_POLICIES = ("expandAperture", "cropAperture", "adjustApertureWidth", "adjustApertureHeight")
 # Values of sourceName for the colour of the picture.

@@ -24,8 +24,7 @@ from .stage_meshes import COLORS, GPRIMS, ShapeReader, are_invertible
 from .stage_settings import read_settings
 from .stage_warnings import StageWarnings
 
-# Values of model:drawMode without a proxy.
-_FULL_MODES = (None, "default", "inherited")
+_FULL_MODES = (None, "default", "inherited")  # Values of model:drawMode without a proxy
 # Types of containers, and of prims that are read with others.
 _SILENT = ("", "Xform", "Scope", "Material", "Shader", "NodeGraph", "Camera", "GeomSubset", "SkelRoot", "Skeleton")
 # Types of prims of a camera rig.
@@ -39,9 +38,9 @@ class StageReader:
     def __init__(
         self,
         path: str | Path,
-        camera: str | None = None,  # Path of the camera. By default that of the stage's render settings, or the first
+        camera: str | None = None,  # By default that of the render settings, or the first
         notes: StageWarnings | None = None,
-        over: str | Path | None = None,  # A layer that is stronger than the file
+        over: str | Path | None = None,  # Layer that is stronger than the file
     ) -> None:
         self._path, self._camera, self._notes, self._over = path, camera, notes or StageWarnings(), over
         self._stage: Usd.Stage | None = None
@@ -101,8 +100,7 @@ def _all_prims(stage: Usd.Stage) -> Iterator[Usd.Prim]:
 
 
 def _may_vary(prim: Usd.Prim) -> bool:
-    # Velocities move instances whose positions have one time.
-    is_instancer = prim.IsA(UsdGeom.PointInstancer)
+    is_instancer = prim.IsA(UsdGeom.PointInstancer)  # Velocities move instances whose positions have one time
     return any(
         attribute.ValueMightBeTimeVarying() or (is_instancer and "elocities" in attribute.GetName())
         for attribute in prim.GetAuthoredAttributes()
@@ -124,8 +122,7 @@ class _StageWalk:
         self._prototypes: list[SceneContents] = []
         # Names of primvars of shapes in instances, and whether a part resets its transform, by prototype and bindings.
         self._inherited: dict[tuple[object, ...], tuple[list[str], bool]] = {}
-        # Instancers whose prototypes are being read.
-        self._open: list[Sdf.Path] = []
+        self._open: list[Sdf.Path] = []  # Instancers whose prototypes are being read
 
     def contents(self, camera: str | None) -> SceneContents:
         up = str(UsdGeom.GetStageUpAxis(self._stage)).lower()
@@ -261,7 +258,6 @@ class _StageWalk:
         return *key, *texts, place, str(animation.GetPath()) if animation else ""
 
     def _bindings(self, prim: Usd.Prim) -> tuple[object, ...]:
-        """Material bindings of an instance and its ancestors; with collections, the materials of its parts."""
         above = (self._stage.GetPrimAtPath(path) for path in prim.GetPath().GetPrefixes())
         if any(ancestor.GetPropertiesInNamespace("material:binding:collection") for ancestor in above):
             return tuple(self._materials_below(prim))
@@ -337,7 +333,6 @@ class _StageWalk:
         return Usd.TimeCode(firsts[0]) if firsts else self._code
 
     def _prototype(self, key: object, root: Usd.Prim) -> int:
-        """Number of the prototype with a key, which is read once."""
         if key not in self._numbers:
             below = self._below(root)
             # Mitsuba has no instances within instances.

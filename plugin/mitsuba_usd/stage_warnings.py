@@ -8,8 +8,7 @@ from contextlib import contextmanager
 
 from mitsuba_subdivision.cage import noting_warnings, shortened, warn, without_warnings
 
-# Number of prims in a message, and most characters of their names.
-_SHOWN, _LENGTH = 3, 200
+_SHOWN, _LENGTH = 3, 200  # Number of prims in a message, and most characters of their names
 # Details in which messages of one kind differ: texts in parentheses or quotes, paths and numbers.
 _DETAILS = re.compile(r"\([^()]*\)|\"[^\"]*\"|(?<!\w)/\S+|\d+(?:[.,]\d+)*")
 
@@ -20,8 +19,7 @@ class StageWarnings:
     def __init__(self, ignored: Iterable[str] = ()) -> None:
         self._warned = set(ignored)
         self._prims: dict[str, list[str]] = {}
-        # First message of each kind whose messages name a prim.
-        self._first: dict[str, str] = {}
+        self._first: dict[str, str] = {}  # First message of each kind whose messages name a prim
 
     def add(self, what: str, prim: object) -> None:
         """Record a problem of a prim, with its consequence, in the words of its kind."""

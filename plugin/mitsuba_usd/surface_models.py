@@ -16,10 +16,8 @@ from .materialx_nodes import constant, is_all, is_constant, node, node_of
 
 Given = Callable[[str], Input]
 WHITE, BLACK = [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]
-# Cosine of OpenPBR's 82 degrees, where colours of metals differ most.
-COSINE_82 = 1 / 7
-# Smallest visible difference of reflectances at an edge.
-_VISIBLE = 0.05
+COSINE_82 = 1 / 7  # Cosine of OpenPBR's 82 degrees, where colours of metals differ most
+_VISIBLE = 0.05  # Smallest visible difference of reflectances at an edge
 
 # Material inputs and their defaults. Widths of GGX lobes are the square of roughness.
 NEUTRAL: dict[str, Input] = {
@@ -282,7 +280,6 @@ def has_white_edges(base: Input, edge: Input) -> bool:
 
 
 def _below_coat(coat: Input, ior: Input) -> Input:
-    """Transmittance of a coat at normal incidence."""
     return _complement(number("multiply", coat, reflectance(ior)))
 
 

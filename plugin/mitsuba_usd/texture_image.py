@@ -27,14 +27,10 @@ _REC_709 = np.array([(0.64, 0.33), (0.3, 0.6), (0.15, 0.06), (0.3127, 0.329)])
 _SAME_PRIMARIES = 1e-6
 # From XYZ to responses of cones (Lam 1985).
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-# Largest scale of a decoded JPEG file, with one value of each block of 8 by 8 pixels.
-_MOST_SCALE = 8
-# Tile 1001 + u + 10 v covers texture coordinates from (u, v) to (u + 1, v + 1).
-_FIRST_TILE, _TILES_IN_ROW = 1001, 10
-# Largest integers that a table decodes.
-_TABULATED = 65535
-# Pixels that are halved at once, as linear values take four times the memory of bytes.
-_PIXELS_AT_ONCE = 1 << 18
+_MOST_SCALE = 8  # Largest scale of a decoded JPEG file, with one value of each block of 8 by 8 pixels
+_FIRST_TILE, _TILES_IN_ROW = 1001, 10  # Tile 1001 + u + 10 v covers texture coordinates from (u, v) to (u + 1, v + 1)
+_TABULATED = 65535  # Largest integers that a table decodes
+_PIXELS_AT_ONCE = 1 << 18  # Pixels that are halved at once, as linear values take four times the memory of bytes
 # Linear values of 16 bits for bytes of sRGB, and back.
 _LINEAR = np.round(65535 * decoded(np.arange(256) / 255)).astype(np.uint16)
 _ENCODED = np.round(255 * encoded(np.arange(65536) / 65535)).astype(np.uint8)
@@ -50,12 +46,12 @@ class TextureImage:
 
 
 def read_texture_image(
-    path: str,  # `a.usdz[b.png]` for a file in an archive; with "<UDIM>" for all existing tiles
-    color_space: str = "auto",
-    needed: float = math.inf,  # Pixels along the sides of a file that pictures show; see `halvings`
-    most: int | None = None,  # Most pixels along the sides of a file
+    path: str, color_space: str = "auto", needed: float = math.inf, most: int | None = None
 ) -> TextureImage:
-    """Read the image of a texture. Raises OSError, RuntimeError, KeyError, zipfile.BadZipFile if it is unreadable."""
+    """Read a file, ``a.usdz[b.png]``, or all tiles of a path with "<UDIM>", with sides as in `halvings`.
+
+    Raises OSError, RuntimeError, KeyError, zipfile.BadZipFile if it is unreadable.
+    """
     if UDIM not in path:
         return TextureImage(_pixels(path, color_space, needed, most), np.eye(3))
     from pxr import UsdShade
@@ -69,7 +65,6 @@ def read_texture_image(
 
 
 def _joined(tiles: list[NDArray], uv: NDArray[np.int64]) -> TextureImage:
-    """One image of tiles at ``(n, 2)``, enlarged to the size of the largest."""
     first, (columns, rows) = uv.min(axis=0), np.ptp(uv, axis=0) + 1
     height, width, channels = np.max([tile.shape for tile in tiles], axis=0)
     dtype = max((tile.dtype for tile in tiles), key=lambda dtype: (dtype.kind == "f", dtype.itemsize))
@@ -105,8 +100,7 @@ def with_alpha(picture: NDArray) -> NDArray:
 def _resampled(values: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
     if values.shape[:2] == size:
         return values
-    # The filter overshoots.
-    bounds = float(values.min()), float(values.max())
+    bounds = float(values.min()), float(values.max())  # The filter overshoots
     return np.array(mi.Bitmap(values).resample(mi.ScalarVector2u(size[1], size[0]), clamp=bounds)).reshape(*size, -1)
 
 
@@ -125,8 +119,7 @@ def _pixels(path: str, color_space: str, needed: float, most: int | None) -> NDA
         with zipfile.ZipFile(inside[1]) as archive:
             content = archive.read(inside[2])
     else:
-        # Mitsuba's message about a missing file has several lines.
-        content = Path(path).read_bytes()
+        content = Path(path).read_bytes()  # Mitsuba's message about a missing file has several lines
     pixels = _scaled_jpeg(content, color_space, needed, most) if content.startswith(_JPEG) else None
     if pixels is None:
         stream = mi.MemoryStream()
@@ -188,8 +181,7 @@ def _scaled_jpeg(content: bytes, color_space: str, needed: float, most: int | No
     try:
         opened = JpegImageFile(io.BytesIO(content))
     except SyntaxError:
-        # Mitsuba raises an error with the reason.
-        return None
+        return None  # Mitsuba raises an error with the reason
     with opened as image:
         is_srgb = color_space == "sRGB" or (color_space == "auto" and len(image.getbands()) >= 3)
         scale = min(1 << max(halvings(image.size, needed, most) - is_srgb, 0), _MOST_SCALE)

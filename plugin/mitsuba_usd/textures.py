@@ -29,15 +29,12 @@ Picture = tuple[NDArray[np.float32], NDArray[np.float64]]
 
 
 class Textures:
-    """Builder of textures from images, each read once."""
+    """Builder of textures from images, each read once.
 
-    def __init__(
-        self,
-        notes: StageWarnings,
-        # Pixels along the sides of image files that pictures show; see `texels_for_pictures`
-        needed: Mapping[str, float] | None = None,
-        most: int | None = None,  # Pixels along their sides at most
-    ) -> None:
+    Sides of image files have as many pixels as pictures need (see `texels_for_pictures`), and the given number at most.
+    """
+
+    def __init__(self, notes: StageWarnings, needed: dict[str, float] | None = None, most: int | None = None) -> None:
         self._notes, self._needed, self._most = notes, needed or {}, most
         # By file and the colour space in which it is halved; None for whole images.
         self._pictures: dict[tuple[str, str | None], TextureImage | None] = {}
@@ -220,7 +217,6 @@ def _filled(
     size: tuple[int, int],
     shared: NDArray[np.float64] | None = None,  # Transform of all images; by default, the unit square
 ) -> NDArray[np.float32]:
-    """Values at the centres of all pixels, some rows at a time to bound the memory."""
     height, width = size
     u = (np.arange(width) + 0.5) / width
     to_uv = np.eye(2) if shared is None else shared[:2, :2]
@@ -275,8 +271,7 @@ def _looked_up(values: Values, uv: Values, wrap: str) -> Values:
     from scipy.ndimage import map_coordinates
 
     height, width = values.shape[:2]
-    # `map_coordinates` needs an array of points.
-    x, y = np.moveaxis(np.atleast_2d(uv), -1, 0)
+    x, y = np.moveaxis(np.atleast_2d(uv), -1, 0)  # `map_coordinates` needs an array of points
     places = (1 - y) * height - 0.5, x * width - 0.5
     modes: dict[str, Any] = {"repeat": "grid-wrap", "mirror": "reflect", "clamp": "nearest"}
     mode = modes[wrap]

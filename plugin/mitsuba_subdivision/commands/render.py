@@ -29,7 +29,7 @@ from ..regression.image import METADATA_ATTRIBUTE
 from ..regression.scene import BOX, LoadedScene, kept_search_folders, load_scene, render_image
 from ..regression.tiers import Tolerances
 from ..shapes.parameter_table import SHADINGS
-from ..studio import AOVS, DEFAULT_VIEW, Look, sampler, variant_in_use
+from ..studio import AOVS, DEFAULT_VIEW, Look, sampler
 from ..studio.animation import FrameRange, SceneSource, StillPicture, Turntable
 from ..studio.cage_scenes import CageScenes
 from ..studio.picture import denoised, require_denoiser, shading_for, weigh_lights
@@ -572,7 +572,7 @@ def _source(options: argparse.Namespace) -> SceneSource[Any]:
         if getattr(options, name):
             flag = f"--{name.replace('_', '-')}"
             raise ValueError(f'{flag} was given for one cage of "{options.scene}"; expected it for a whole USD file')
-    shading = shading_for(variant_in_use(), {"shading": options.shading or "auto"})
+    shading = shading_for({"shading": options.shading or "auto"})
     return CageScenes(options.scene, replace(look, shading=shading), prim=options.prim, scheme=options.scheme, **which)
 
 

@@ -29,35 +29,21 @@ from ..variants import SceneNode
 from .animation import SceneSource, StillPicture, load_quietly, set_parameters
 from .obj_materials import Material, material_bsdf, material_emitter, read_materials
 from .picture import MOST_SEGMENTS, highest_rate, outline_for, segments_for, shading_for, triangles_for
-from .studio_entries import (
-    DEFAULT_SIZE,
-    DEFAULT_SPP,
-    DEFAULT_VIEW,
-    Look,
-    View,
-    enlargement,
-    finished,
-    studio,
-    variant_in_use,
-)
+from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, DEFAULT_VIEW, Look, View, enlargement, finished, studio
 
 CLAY = (0.56, 0.52, 0.47)
 CHECKER = (0.15, 0.23, 0.32), (0.72, 0.68, 0.61)
-# Squares along a texture coordinate from 0 to 1.
-CHECKER_SQUARES = 16
-# Attributes that are shown in place of clay: of PLY files, and of USD's meshes.
+CHECKER_SQUARES = 16  # Squares along a texture coordinate from 0 to 1
+# Attributes that replace the colour of clay: of PLY files, and of USD's meshes.
 COLOURS = ("color", "displayColor")
-WIRE_COLOUR = (0.015, 0.05, 0.12)
-WIRE_RATE = 2
-# Radius of the rods, in radii of the model, and at most in lengths of the middle edge. Balls are thicker.
+WIRE_COLOUR, WIRE_RATE = (0.015, 0.05, 0.12), 2
+# Radius of the rods, in radii of the model; its maximum, in lengths of the median edge; and radius of balls, in rods.
 ROD, ROD_PER_EDGE, BALL = 0.0045, 0.05, 2.2
-# Square tubes and cubes have round limit surfaces, which lie so far within them: of the distance of a corner.
+# Radius of the round limit surfaces of square tubes and cubes, in distances of a corner.
 _TUBE_LIMIT, _CUBE_LIMIT = 2 / 3, 1 / 2
-# Quadrilaterals of a tessellation: enough for a picture of usual size. Coarse cages have no more segments per edge than
-# the picture shows.
-QUADS = 200_000
-HIGHEST_DEFAULT_RATE = 24
-# Segments per edge between which a camera's frame may be missed, by far less than its margin; of large cages 1.
+# Quadrilaterals of a tessellation for a picture of usual size, and its highest rate.
+QUADS, HIGHEST_DEFAULT_RATE = 200_000, 24
+# Rate of points that a camera frames, which misses far less than the margin; and faces of cages with a rate of 1.
 FRAME_RATE, LARGE = 4, 20_000
 
 
@@ -80,10 +66,9 @@ class Model:
 
     @cached_property
     def materials(self) -> dict[str, Material]:
-        """Materials that the libraries of an OBJ file describe, by name."""
-        is_obj = self.path is not None and self.path.suffix.lower() == ".obj"
+        """Materials in the libraries of an OBJ file, by name."""
         by_face = self.surface.scheme.element == "face" or len(self.cage.materials) == 1
-        if not (self.path and is_obj and self.cage.materials and by_face):
+        if self.path is None or self.path.suffix.lower() != ".obj" or not (self.cage.materials and by_face):
             return {}
         described = read_materials(self.path)
         missing = ", ".join(f'"{name}"' for name in self.cage.materials if name and name not in described)
@@ -93,12 +78,12 @@ class Model:
 
     @cached_property
     def up(self) -> str:
-        """Axis that points up, "y" or "z", by its file; z for cages that are not from a file."""
+        """Axis that points up, "y" or "z", of the file; z for cages in memory."""
         return "z" if self.path is None else FORMATS[self.path.suffix.lower()].up or stage_up_axis(self.path)
 
     @property
     def default_rate(self) -> int:
-        """Segments per edge that are enough for a picture."""
+        """Segments per edge for a picture of usual size."""
         return max(2, min(HIGHEST_DEFAULT_RATE, isqrt(QUADS // self.cage.face_count)))
 
     @cached_property
@@ -135,8 +120,7 @@ class Model:
         """Control points of the rods and balls, from the control points ``(n, 3)`` of the cage."""
         ends, radius = control_points[self.cage.edges], self.wire_radius
         along = _unit(ends[:, 1] - ends[:, 0])
-        # The axis that is furthest from the edge.
-        axis = np.eye(3)[np.abs(along).argmin(axis=1)]
+        axis = np.eye(3)[np.abs(along).argmin(axis=1)]  # The axis that is furthest from the edge
         side = _unit(np.cross(along, axis))
         across = np.stack([side, np.cross(along, side)], axis=1)
         ring = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]) @ across * (radius / _TUBE_LIMIT)
@@ -146,7 +130,7 @@ class Model:
         return np.concatenate([tubes.reshape(-1, 3), balls.reshape(-1, 3)])
 
     def triangles_for(self, sensor: SceneNode, factor: float = 1.0) -> SceneNode:
-        """Parameters of the coarsest exactly shaded tessellation whose facets this sensor of a scene does not see."""
+        """Parameters of the coarsest exactly shaded tessellation without visible facets for a sensor."""
         outline, corners = outline_for(sensor), int(self.cage.face_sizes.sum())
         to_world = np.diag([factor, factor, factor, 1.0])[None]
         segments = segments_for(self.cage, to_world, outline, sensor["near_clip"], "exact")
@@ -159,7 +143,7 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return vectors / np.where(lengths > 0, lengths, 1)
 
 
-# A model with control points of a frame, ``(n, 3)`` float64.
+# Model and control points ``(n, 3)`` of a frame.
 PosedModel = tuple[Model, NDArray[np.float64]]
 
 
@@ -187,8 +171,7 @@ class CageScenes(SceneSource[PosedModel]):
         super().__init__(cage, name, look, time, numbers)
         self._cage, self._prim, self._scheme = cage, prim, scheme
         self._rules = {"scheme": scheme} if scheme else {}
-        # Contents and model of the first frame that is read.
-        self._first: Any = None
+        self._first: Any = None  # Contents and model of the first frame that is read
         self._kept = tempfile.TemporaryDirectory()
         weakref.finalize(self, self._kept.cleanup)
 
@@ -269,11 +252,9 @@ class CageScenes(SceneSource[PosedModel]):
             yield shared
 
     def _shapes(self, model: Model, triangles: SceneNode | None = None, *, in_memory: bool = False) -> SceneNode:
-        """Entries of the limit surface and of the drawn cage."""
         look = self._look
         if in_memory or model.path is None:
-            # The cage is that of `prim` at `time`.
-            cage = model.cage.as_properties(mi) | self._rules
+            cage = model.cage.as_properties(mi) | self._rules  # The cage is that of `prim` at `time`
         else:
             cage = {"filename": str(model.path.resolve()), **model.chosen}
         triangles = triangles or {"tessellation_rate": look.rate or model.default_rate}
@@ -291,12 +272,11 @@ class CageScenes(SceneSource[PosedModel]):
 
 
 def _in_materials(model: Model, surface: SceneNode, in_memory: bool) -> SceneNode:
-    """A shape for each material of a cage: "surface", "surface_2" and so on. All have the same vertices."""
+    """Shapes for the materials of a cage, "surface", "surface_2" and so on, with the same vertices."""
     shapes: SceneNode = {}
     if not model.materials:
         return shapes
-    # Any, as the stubs call it an object.
-    tensor: Any = mi.TensorXu
+    tensor: Any = mi.TensorXu  # The stubs call it an object
     for name, faces in model.cage.materials.items():
         material = model.materials.get(name)
         shown = {"shown_faces": tensor(faces.astype(np.uint32))} if in_memory else {"material": name}
@@ -325,8 +305,7 @@ def _material(cage: ControlCage, checker: bool = False) -> SceneNode:
             "to_uv": mi.ScalarTransform4f().scale([CHECKER_SQUARES / 2, CHECKER_SQUARES / 2, 1]),
         }
     clay = {"type": "principled", "base_color": colour, "roughness": 0.42, "specular": 0.5}
-    # Open surfaces are seen from both sides.
-    return {"type": "twosided", "bsdf": clay}
+    return {"type": "twosided", "bsdf": clay}  # Open surfaces are seen from both sides
 
 
 def studio_scene(
@@ -382,6 +361,5 @@ def studio_scene(
     ValueError
         If the view, the axis or the size is invalid.
     """
-    shading = shading_for(variant_in_use(), {"shading": shading})
-    look = Look(view, size, spp, up, rate, shading, checker, cage)
+    look = Look(view, size, spp, up, rate, shading_for({"shading": shading}), checker, cage)
     return StillPicture(CageScenes(model, look, prim=prim, time=time, scheme=scheme)).scene

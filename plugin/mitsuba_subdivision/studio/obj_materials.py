@@ -17,8 +17,7 @@ _NUMBERS = {"Kd": 3, "Ks": 3, "Ke": 3, "Ns": 1, "d": 1, "Tr": 1, "illum": 1, "Pr
 _TEXTURE = "map_Kd"
 # Entries about ambient light, and the index of refraction, in whose place Ks gives the strength of highlights.
 _WITHOUT_EFFECT = ("Ka", "map_Ka", "Ni")
-# Models of the entry "illum" without highlights.
-_MATTE = (0, 1)
+_MATTE = (0, 1)  # Models of the entry "illum" without highlights
 
 # Options of a map, with the number of their values; of the last three, all but the first value may be missing.
 _OPTIONS = {
@@ -29,8 +28,6 @@ _OPTIONS = {
 # Options without effect on colours: strengths of bumps, sharpness and size of small pictures.
 _OPTIONS_WITHOUT_EFFECT = ("-bm", "-boost", "-cc", "-texres")
 _EXPECTED = "Kd, map_Kd (with -s, -o, -mm, -clamp, -blendu and -blendv), Ks, Ns, Ke, d, Tr, illum, Pr and Pm"
-
-
 # Numbers of entries, and the texture of ``map_Kd``.
 Material = dict[str, list[float] | SceneNode]
 
@@ -51,7 +48,7 @@ def read_materials(path: Path) -> dict[str, Material]:
 
 
 def _libraries(folder: Path, names: str) -> list[Path]:
-    """Files that a statement ``mtllib`` names: one whose name may have spaces, or several that end in ".mtl"."""
+    """Files of a statement ``mtllib``: one whose name may have spaces, or several that end in ".mtl"."""
     names = _without_comment(names)
     whole = _file(folder, names)
     if whole.is_file():
@@ -135,8 +132,7 @@ def _texture(folder: Path, text: str, left_out: dict[str, None]) -> SceneNode:
         bitmap = np.array(mi.Bitmap(str(path)).convert(*form, srgb_gamma=False))
         values = np.clip(base_and_gain[0] + base_and_gain[1] * bitmap, 0, 1)
         picture = {"bitmap": mi.Bitmap(values.astype(np.float32))}
-    # OBJ's v points up, a bitmap's down.
-    to_uv = mi.ScalarTransform4f().translate([0, 1, 0]).scale([1, -1, 1])
+    to_uv = mi.ScalarTransform4f().translate([0, 1, 0]).scale([1, -1, 1])  # OBJ's v points up, a bitmap's down
     return {
         "type": "bitmap",
         **picture,

@@ -32,21 +32,17 @@ UP_AXES = ("y", "z")
 View = str | Sequence[float]
 # Field of view of the picture's longer side, in degrees: that of long lenses for products and portraits.
 FIELD_OF_VIEW = 28.0
-# Part of the picture that stays empty on each side.
-MARGIN = 0.08
-# Least distance of the nearest point, in depths of the model: the furthest point then looks a fifth as large.
+MARGIN = 0.08  # Empty part of the picture on each side
+# Least distance of the nearest point, in depths of the model: the furthest point looks a fifth as large.
 NEAREST = 0.25
 DEFAULT_SIZE, DEFAULT_SPP, LARGEST_SIDE = (640, 480), 64, 1 << 14
-# Sizes of models that Mitsuba renders alike, as measured: lengths are squared in single precision.
-SIZES = (1e-9, 5e8)
-# Largest side of models that are enlarged, and the least side that they get: Mitsuba moves the origins of rays from
-# surfaces away by 9e-5 of a unit, or of their coordinates if these are more.
+SIZES = (1e-9, 5e8)  # Measured sizes of models that Mitsuba renders alike: lengths are squared in single precision
+# Largest side of models to enlarge, and their least enlarged side: Mitsuba offsets rays from surfaces by 9e-5 of a
+# unit, or of larger coordinates.
 SMALL, LARGE_ENOUGH = 1.0, 8.0
-# Of boxes: points beyond are infinite in single precision.
-LARGEST_BOX = 1e37
-
+LARGEST_BOX = 1e37  # Side of the largest box that is finite in single precision
 # Positions of lights, in radii of the model: right, back and up of its middle, for a camera in front. Then half their
-# sides, their radiance, and their sampling weights, chosen for least noise.
+# sides, their radiance, and their sampling weights of least noise.
 LIGHTS = {
     "key_light": ((-4.4, -1.9, 4.4), (1.5, 1.5), (16.0, 15.4, 14.6), 3.0),
     "fill_light": ((5.5, -4.0, 1.6), (2.5, 2.5), (0.55, 0.58, 0.62), 0.25),
@@ -57,18 +53,16 @@ STUDIO = (*LIGHTS, "ambient_light", "ground")
 ENVIRONMENT = "environment"
 # Entries that turn with the camera.
 RIG = (*LIGHTS, "ground", ENVIRONMENT)
-AMBIENT = (0.17, 0.175, 0.185)
-BACKDROP_COLOUR = (0.30, 0.305, 0.315)
+AMBIENT, BACKDROP_COLOUR = (0.17, 0.175, 0.185), (0.30, 0.305, 0.315)
 # Types of Mitsuba's integrator `aov`, by their own names and by those of Hydra and of other renderers.
 AOVS = {name: name for name in ("albedo", "depth", "position", "uv", "geo_normal", "sh_normal", "dp_du", "dp_dv")}
 AOVS |= {name: name for name in ("duv_dx", "duv_dy", "prim_index", "shape_index")}
 AOVS |= {"normal": "sh_normal", "normals": "sh_normal", "N": "sh_normal", "Ng": "geo_normal", "P": "position"}
 AOVS |= {"z": "depth", "st": "uv", "primId": "shape_index", "instanceId": "shape_index", "elementId": "prim_index"}
 LENGTHS = ("depth", "position", "dp_du", "dp_dv")
-# Distances behind the model's middle, in radii, at which the backdrop begins to bend and its wall stands.
-BEND, WALL = 1.6, 7.0
-# Distance of the floor below the model, in radii: a flat model must not coincide with the floor.
-GAP = 0.003
+# Distances in radii: of the bend and the wall of the backdrop from the model's middle; and of the floor from the model,
+# as a flat model must not coincide with it.
+BEND, WALL, GAP = 1.6, 7.0, 0.003
 
 
 @dataclass(frozen=True)
@@ -76,26 +70,24 @@ class Look:
     """Display options of a model or a stage."""
 
     view: View = DEFAULT_VIEW  # str or (azimuth, elevation): from where the studio's camera looks
-    # (width, height) or None: of the film, in pixels. None for 640 by 480, or what a stage's render settings or its
-    # camera ask for.
+    # Width and height in pixels; None for those of a stage's render settings or camera, or 640 by 480
     size: tuple[int, int] | None = None
-    spp: int | None = None  # Samples per pixel; None for 64, or what a stage's render settings ask for
+    spp: int | None = None  # Samples per pixel; None for those of a stage's render settings, or 64
     up: str | None = None  # Axis of a cage that points up; None for that of its file
     rate: int | None = None  # Segments on each edge of a cage; None for as many as a picture needs
     shading: str = "vertex"  # Of a cage
     checker: bool = False  # Whether texture coordinates of a cage are shown as a checkerboard
     cage: bool = False  # Whether the control cage is drawn over its surface
-    # Pixels along the sides of the textures of a stage's materials at most; None for as many as the picture shows
-    texture_size: int | None = None
+    texture_size: int | None = None  # Most pixels along the sides of a stage's textures; None for no limit
     transparent: bool = False  # Whether the picture has alpha and no background
     has_studio: bool = True  # Whether the studio adds missing lights, and a backdrop
-    scales: bool = False  # Whether a scene is made larger by `enlargement`
+    scales: bool = False  # Whether small models are enlarged, see `enlargement`
     # Picture of the light from all directions, of equal angles, in place of all lights and the backdrop; its turn about
     # the axis that points up, in degrees, counter-clockwise seen from above; and the factor of its radiance
     environment: Path | None = None
     turn: float = 0.0
     strength: float = 1.0
-    # Types of Mitsuba's AOVs by the names of their channels, besides those of a stage; None for no channels at all
+    # Types of Mitsuba's AOVs by the names of their channels, besides those of a stage; None for no AOVs at all
     aovs: Mapping[str, str] | None = None
 
 
@@ -116,13 +108,11 @@ def studio(
     points: ArrayLike | None = None,
     name: str | None = None,  # Of the model, or of its file, with which messages begin
 ) -> SceneNode:
-    """Entries of a Mitsuba scene that stage a model: all but the model and ``"type": "scene"``.
+    """Entries of a scene around a model: "integrator", "sensor", lights and, in views from above, "ground".
 
-    A variant of Mitsuba must be set. The studio is sized for the model, and its lights turn with the camera. Where the
-    camera is below the model's middle there is no floor, and lights come from below.
-    Returns "integrator", "sensor", "key_light", "fill_light", "rim_light", "ambient_light" and, in views from above,
-    "ground". Raises ValueError if no variant is set, or an argument is invalid. Warns if the model is so small or large
-    that Mitsuba's single precision does not render it.
+    A variant of Mitsuba must be set. The studio is sized for the model, and its lights turn with the camera. In views
+    from below there is no floor, and lights come from below. Raises ValueError if no variant is set, or an argument is
+    invalid. Warns if Mitsuba's single precision cannot render the size of the model.
     """
     variant_in_use()
     prefix = "" if name is None else f"{name}: "
@@ -212,7 +202,6 @@ def _is_glowing_mesh(entry: Any) -> bool:
 
 def framed(
     points: NDArray[np.float64],  # (n, 3) float64: in the studio's axes
-    # Where the camera is, seen from the points, in degrees
     azimuth: float,
     elevation: float,
     size: tuple[int, int],  # (width, height)
