@@ -57,26 +57,21 @@ def radiance(material: MaterialContents, textures: Textures, notes: StageWarning
 
 def interior(material: MaterialContents | None) -> SceneNode:
     """Property ``interior`` of a shape: the medium of an absorbing material."""
-    if material is None or not absorbs(material):
+    inputs = {} if material is None else material.inputs
+    depth, depth_color = inputs.get("depth", 0.0), inputs.get("depth_color")
+    is_clear_body = inputs.get("transmission", 0.0) != 0 and inputs.get("thin", 0.0) == 0
+    is_deep = isinstance(depth, (int, float)) and depth > 0
+    if not (is_clear_body and is_deep) or depth_color is None or not is_constant(depth_color):
         return {}
     # Transmittance along the depth (Beer and Lambert).
-    color = np.clip(constant(material.inputs["depth_color"], 3), 1e-4, 1)
-    extinction = -np.log(color) / _first(material.inputs["depth"])
+    extinction = -np.log(np.clip(constant(depth_color, 3), 1e-4, 1)) / _first(depth)
     most = max(float(extinction.max()), 1e-6)  # Mitsuba's colours end at 1
     return {"interior": {"type": "homogeneous", "albedo": 0.0, "sigma_t": rgb(extinction / most), "scale": most}}
 
 
-def absorbs(material: MaterialContents) -> bool:
-    """Whether the interior of a material absorbs light."""
-    inputs = material.inputs
-    depth, thin = inputs.get("depth", 0.0), inputs.get("thin", 0.0)
-    is_deep = isinstance(depth, (int, float)) and depth > 0 and thin == 0 and "depth_color" in inputs
-    return is_deep and inputs.get("transmission", 0.0) != 0 and is_constant(inputs["depth_color"])
-
-
 def integrator(materials: list[MaterialContents], usual: SceneNode, *, has_clear_lamps: bool = False) -> SceneNode:
     """The usual integrator, with paths that are long enough for glass, and with media and clear lamps if needed."""
-    kind = "volpath" if has_clear_lamps or any(map(absorbs, materials)) else usual["type"]
+    kind = "volpath" if has_clear_lamps or any(map(interior, materials)) else usual["type"]
     # BSDFs of Mitsuba may be glass.
     if all(material.inputs.get("transmission", 0.0) == 0 and "bsdf" not in material.inputs for material in materials):
         return {**usual, "type": kind}
@@ -120,7 +115,6 @@ class _Surface:
         return rgb(np.clip(value, 0, 1))
 
     def _plugin(self, given: Input, name: str = "") -> Any:
-        """A parameter of a plugin of Mitsuba, or the plugin itself."""
         if isinstance(given, NodeContents) and given.type == PLUGIN:
             kept = {k: v for k, v in given.inputs.items() if k and (given.category, k) not in self._lacking}
             return {"type": given.category, **{key: self._plugin(value, key) for key, value in kept.items()}}

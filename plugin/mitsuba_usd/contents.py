@@ -198,7 +198,7 @@ class PictureContents:
     """Render settings of a stage, and of its first render product."""
 
     name: str = ""  # Path of the prim
-    resolution: list[int] | None = None
+    resolution: tuple[int, int] | None = None
     window: list[float] = field(default_factory=lambda: WHOLE)  # Rendered part of the picture
     is_transparent: bool = False  # Whether pictures have alpha
     spp: int | None = None  # Samples per pixel

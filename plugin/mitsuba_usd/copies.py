@@ -64,16 +64,14 @@ def with_copies(
     """
     is_displaced = any(shape.is_displaced for group in contents.groups for shape in group)
     are_many = len(contents.instances) >= LEAST_INSTANCES and not is_displaced
-    of_group: dict[int, list[NDArray[np.float64]]] = {}
-    for instance in contents.instances if are_many else []:
-        of_group.setdefault(instance.group, []).append(instance.to_world)
+    placements = contents.placements if are_many else {}
     # Name of the copies of each shape, their transforms (n, 4, 4) to the world, and the rates (n,) that they need.
     placed: dict[ShapeContents, tuple[str, NDArray[np.float64]]] = {}
     needed: dict[ShapeContents, IntArray] = {}
-    for number, matrices in sorted(of_group.items()):
-        for shape in contents.groups[number]:
-            placed[shape] = f"/copies_{number}{shape.name}", np.stack(matrices) @ shape.to_world
-            needed[shape] = rates.get(shape, np.ones(len(matrices), np.int64))
+    for number, group in enumerate(contents.groups):
+        for shape in filter(placements.__contains__, group):
+            placed[shape] = f"/copies_{number}{shape.name}", placements[shape]
+            needed[shape] = rates.get(shape, np.ones(len(placements[shape]), np.int64))
     of_cage: dict[tuple[int, int], list[ShapeContents]] = {}
     for shape in contents.shapes:
         if len(shape.cage.face_sizes) < LARGE and not shape.is_displaced:
@@ -115,7 +113,6 @@ def _allowed_bytes() -> float:
 
 
 def _bytes(rates: Rates, most: int, shading: str) -> float:
-    """Memory of copies as one mesh, with rates up to ``most``."""
     total = 0.0
     for shape, of_copies in rates.items():
         cage, is_smooth, count = shape.cage, shape.cage.scheme is not None, len(of_copies)

@@ -85,10 +85,8 @@ def _dome(light: LightContents, textures: Textures) -> SceneNode:
     bitmap = None if light.texture is None else textures.radiance(light.texture, radiance)
     if bitmap is None:
         return {"type": "constant", "radiance": rgb(radiance)}
-    turned = light.to_world.copy()
+    turned = light.to_world @ (_POLE_TO_Z if light.pole == "z" else np.eye(4))
     turned[:3, 3] = 0
-    if light.pole == "z":
-        turned = turned @ _POLE_TO_Z
     return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(turned.tolist())}
 
 

@@ -64,9 +64,7 @@ def evaluate(
             return np.asarray(part.fallback, dtype=np.float32)
         if part.category == "texcoord":
             return points
-        if part.category == "image":
-            file = part.inputs["file"]
-            assert isinstance(file, TextureContents)
+        if part.category == "image" and isinstance(file := part.inputs["file"], TextureContents):
             return texels(file, value_of(part.inputs["texcoord"]))
         inputs = {name: value_of(value) for name, value in part.inputs.items()}
         if part.category == "heighttonormal":
@@ -150,11 +148,8 @@ def _hsv(values: Values) -> Values:
     most, least = color.max(axis=-1), color.min(axis=-1)
     delta = most - least
     red, green, blue = np.moveaxis(color, -1, 0)
-    sector = np.where(
-        red >= most,
-        (green - blue) / delta,
-        np.where(green >= most, 2 + (blue - red) / delta, 4 + (red - green) / delta),
-    )
+    beyond_red = np.where(green >= most, 2 + (blue - red) / delta, 4 + (red - green) / delta)
+    sector = np.where(red >= most, (green - blue) / delta, beyond_red)
     hue = np.where(delta > 0, (sector / 6) % 1.0, 0.0)
     saturation = np.where(most > 0, delta / most, 0.0)
     return _with_alpha(np.stack([hue, saturation, most], axis=-1), values)
@@ -208,7 +203,6 @@ def _fractal(points: Values, n: SimpleNamespace, width: int) -> Values:
 
 
 def _cells(points: Values) -> Values:
-    """A random number from 0 to 1 for each unit square."""
     return _random_numbers(*np.moveaxis(np.floor(points).astype(np.int64), -1, 0))[..., None]
 
 
@@ -230,7 +224,6 @@ def _worley(n: SimpleNamespace) -> Values:
 
 
 def _slope(hashed: Hash, x: Values, y: Values) -> Values:
-    """Product of an offset and one of 8 directions."""
     direction = hashed & 7
     u = np.where(direction < 4, x, y)
     v = 2 * np.where(direction < 4, y, x)

@@ -100,7 +100,11 @@ def texels_for_pictures(contents: SceneContents, sensors: Sequence[SceneNode]) -
     for shape, copies in contents.placements.items():
         if shape.material is None:
             continue
-        texels = TEXELS_PER_PIXEL * _pixels_of_texcoords(shape.cage, copies, seen)
+        lengths, in_texture = (np.linalg.norm(vectors, axis=1) for vectors in _edges(shape.cage))
+        there, texels = in_texture > 0, np.inf
+        if there.any():
+            scale = float(np.quantile(lengths[there] / in_texture[there], _MOST_EDGES))
+            texels = TEXELS_PER_PIXEL * scale * pixels_of(shape.cage, copies, seen)
         inputs = shape.material.inputs.values()
         # Images at computed texture coordinates have an unknown detail.
         known = [given for given in inputs if not (isinstance(given, NodeContents) and samples_elsewhere(given))]
@@ -113,15 +117,6 @@ def texels_for_pictures(contents: SceneContents, sensors: Sequence[SceneNode]) -
     return needed
 
 
-def _pixels_of_texcoords(cage: CageContents, to_world: NDArray[np.float64], seen: Views) -> float:
-    """Maximum pixels per unit of texture coordinates, for most edges of copies ``(n, 4, 4)``; infinite if unknown."""
-    lengths, in_texture = (np.linalg.norm(vectors, axis=1) for vectors in _edges(cage))
-    there = in_texture > 0
-    if not there.any():
-        return np.inf
-    return pixels_of(cage, to_world, seen) * float(np.quantile(lengths[there] / in_texture[there], _MOST_EDGES))
-
-
 def _edges(cage: CageContents) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Vectors of some edges ``(n, 3)``, and in texture coordinates ``(n, 2)``; none without texture coordinates."""
     if cage.texcoords is None:
@@ -131,11 +126,8 @@ def _edges(cage: CageContents) -> tuple[NDArray[np.float64], NDArray[np.float64]
     ends = np.stack([corners, topology.next[corners]])
     vertices, indices = topology.face_vertices[ends], cage.texcoords.indices
     index = vertices if indices is None else np.asarray(indices)[ends]
-    along, in_texture = (
-        np.diff(np.asarray(values, dtype=np.float64)[rows], axis=0)[0]
-        for values, rows in ((cage.positions, vertices), (cage.texcoords.values, index))
-    )
-    return along, in_texture
+    pairs = np.asarray(cage.positions, np.float64)[vertices], np.asarray(cage.texcoords.values, np.float64)[index]
+    return pairs[0][1] - pairs[0][0], pairs[1][1] - pairs[1][0]
 
 
 def pixels_of(cage: CageContents, to_world: NDArray[np.float64], seen: Views) -> float:

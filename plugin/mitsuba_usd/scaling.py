@@ -61,8 +61,7 @@ def scaled_camera(camera: CameraContents, factor: float) -> CameraContents:
     to_world = camera.to_world.copy()
     to_world[:3, 3] *= factor
     film = 1.0 if camera.is_perspective else factor
-    changed: dict[str, Any] = {
-        name: factor * getattr(camera, name) for name in ("near", "far", "lens_radius", "focus_distance")
-    }
+    lengths = ("near", "far", "lens_radius", "focus_distance")
+    changed: dict[str, Any] = {name: factor * getattr(camera, name) for name in lengths}
     changed |= {name: [film * length for length in getattr(camera, name)] for name in ("aperture", "offset")}
     return replace(camera, to_world=to_world, **changed)

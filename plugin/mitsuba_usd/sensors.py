@@ -103,13 +103,9 @@ def _field_of_view(wide: float, camera: CameraContents) -> SceneNode:
 
 def size_for(contents: SceneContents, look: Look) -> tuple[int, int]:
     """Size of the film: of the look, of the render settings, or 640 pixels by the aspect ratio of the aperture."""
-    if look.size is not None:
-        return look.size
-    if contents.picture.resolution is not None:
-        width, height = contents.picture.resolution
-        return width, height
-    if contents.camera is None:
-        return DEFAULT_SIZE
+    stated = look.size or contents.picture.resolution
+    if stated is not None or contents.camera is None:
+        return stated or DEFAULT_SIZE
     wide, high = contents.camera.aperture
     return WIDTH, max(1, round(WIDTH * high / wide))
 

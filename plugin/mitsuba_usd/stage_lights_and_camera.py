@@ -70,21 +70,12 @@ def read_light(
     pole = _value(prim, "poleAxis", time, "scene") if given == "DomeLight_1" else "Y"
     if pole == "scene":
         pole = UsdGeom.GetStageUpAxis(prim.GetStage())
-    light = LightContents(
-        str(path),
-        kind,
-        to_world,
-        read_emission(prim, time).tolist(),
-        is_normalized,
-        size,
-        _texture(prim, time, notes) if kind in ("rect", "dome") else None,
-        str(pole).lower(),
-    )
-    numbers = np.array([*light.emission, *light.size, *to_world.ravel()])
-    is_area = light.kind not in ("distant", "dome", "point", "spot")
-    if not np.isfinite(numbers).all() or np.linalg.det(to_world[:3, :3]) == 0 or (is_area and min(light.size) <= 0):
+    emission = read_emission(prim, time).tolist()
+    numbers, is_area = [*emission, *size, *to_world.ravel()], kind not in ("distant", "dome", "point", "spot")
+    if not np.isfinite(numbers).all() or np.linalg.det(to_world[:3, :3]) == 0 or (is_area and min(size) <= 0):
         raise ValueError("the light is not usable; expected finite numbers, a size above 0 and an invertible transform")
-    return light
+    texture = _texture(prim, time, notes) if kind in ("rect", "dome") else None
+    return LightContents(str(path), kind, to_world, emission, is_normalized, size, texture, str(pole).lower())
 
 
 def read_emission(prim: Usd.Prim, time: Usd.TimeCode) -> NDArray[np.float64]:
@@ -110,8 +101,7 @@ def _note_ignored(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> N
         if value != neutral and not is_cone_kept:
             notes.add(f"{name} of lights is ignored; {reason}", prim.GetPath())
     for name, what in (("light:filters", "light filters"), ("portals", "portals")):
-        relationship = prim.GetRelationship(name)
-        if relationship and relationship.GetTargets():
+        if (relationship := prim.GetRelationship(name)) and relationship.GetTargets():
             notes.add(f"{what} are ignored", prim.GetPath())
     for link in ("lightLink", "shadowLink"):
         root = prim.GetAttribute(f"collection:{link}:includeRoot")

@@ -194,8 +194,7 @@ class MaterialReader:
         if attribute is None:
             stage = shader.GetPrim().GetStage()
             if given and not all(stage.GetPropertyAtPath(path) for path in given.GetAttr().GetConnections()):
-                what = "connections of inputs to missing attributes are ignored"
-                self._notes.add(what, given.GetAttr().GetPath())
+                self._notes.add("connections of inputs to missing attributes are ignored", given.GetAttr().GetPath())
             if kind == "texcoord":
                 what = f"textures read the texture coordinates st where {name} is not connected"
                 self._notes.add(what, shader.GetPath())
@@ -280,7 +279,6 @@ class MaterialReader:
         return self._made(definition, output, self._inputs(shader, self._ports(definition)), path)
 
     def _plugin(self, shader: UsdShade.Shader) -> TextureContents | NodeContents:
-        """A plugin of Mitsuba with its parameters; for "bitmap", its image."""
         name, path = shader.GetShaderId().removeprefix(_PLUGIN), shader.GetPath()
         parameters: dict[str, Input] = {}
         for given in shader.GetInputs():
@@ -342,7 +340,6 @@ class MaterialReader:
         return modes[0]
 
     def _made(self, definition: MaterialX.NodeDef, output: str, inputs: _Inputs, prim: object) -> Input | None:
-        """Expression of a node of MaterialX, in primitive nodes."""
         import MaterialX
 
         category = definition.getNodeString()

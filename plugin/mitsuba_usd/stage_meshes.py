@@ -116,7 +116,6 @@ class ShapeReader:
         return materials, owner
 
     def _primvars(self, material: MaterialContents | None) -> tuple[tuple[str, ...], str | None]:
-        """Names of the primvars of a material, and of its texture coordinates."""
         if material is None:
             return COLORS, None
         names = material.texcoords()

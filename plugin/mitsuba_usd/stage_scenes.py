@@ -172,10 +172,8 @@ class StageScenes(studio.SceneSource[SceneContents]):
         turns: Sequence[NDArray[np.float64]] = (),
     ) -> SceneNode:
         """Entries of a scene, with polygon meshes for `with_meshes`. Raises CageError without a usable mesh."""
-        parameters = self._parameters
-        rest: SceneNode = {}
-        chosen: dict[ShapeContents, dict[str, Any]] = {}
-        needed: dict[str, float] = {}
+        parameters, rest = self._parameters, dict[str, Any]()
+        chosen, needed = dict[ShapeContents, dict[str, Any]](), dict[str, float]()
         is_one_picture = points is None
         points = self.points(contents) if points is None else points
         if not len(points) and not self._look.has_studio:
@@ -183,8 +181,9 @@ class StageScenes(studio.SceneSource[SceneContents]):
         if len(points):
             rest = with_studio_defaults(contents, points, self._is_lit, self._look, self._notes, self.name)
         if rest and (turns or follows_sensor):
-            sensors = [_turned(rest["sensor"], turn) for turn in turns] or [rest["sensor"]]
-            needed = texels_for_pictures(contents, sensors)
+            place, transform = rest["sensor"]["to_world"], mi.ScalarTransform4f
+            moved = [{**rest["sensor"], "to_world": transform(turn.tolist()) @ place} for turn in turns]
+            needed = texels_for_pictures(contents, moved or [rest["sensor"]])
         if rest and is_one_picture:
             contents, chosen = self._for_picture(contents, rest["sensor"], follows_sensor)
         else:
@@ -248,10 +247,9 @@ class StageScenes(studio.SceneSource[SceneContents]):
             contents, _ = self._with_copies(given)
             shapes.begin_frame()
             textures = Textures(self._notes, self._needed, self._look.texture_size)
-            others = {**rest, "sensor": seen}
             any_sensor: list[SceneNode] | None = [] if self._has_free_rates else None
             chosen = with_own_parameters(contents, {}, parameters, any_sensor, textures, self._notes)
-            made = contents, others, self._notes, parameters, Surfaces(), textures, chosen
+            made = contents, {**rest, "sensor": seen}, self._notes, parameters, Surfaces(), textures, chosen
             scene = scene_entries(*made, loaded=shapes)
             self._notes.warn(self.name)
             before = given, seen, studio.load_quietly(studio.finished(scene, self._look, given.up), filter_name)
@@ -263,7 +261,6 @@ class StageScenes(studio.SceneSource[SceneContents]):
         return sensor(contents.camera, size_for(first, self._look), contents.picture, self._look.spp, self._notes)
 
     def _texels_for_frames(self, first: SceneContents, rest: SceneNode) -> dict[str, float]:
-        """Most pixels along the sides of image files in any frame, so that textures do not change between frames."""
         needed: dict[str, float] = {}
         if not any(material.textures() for material in first.materials):
             return needed
@@ -290,10 +287,6 @@ def _moved_sensor(loaded: studio.LoadedScene, before: SceneNode, seen: SceneNode
     return True
 
 
-def _turned(sensor: SceneNode, turn: NDArray[np.float64]) -> SceneNode:
-    return {**sensor, "to_world": mi.ScalarTransform4f(turn.tolist()) @ sensor["to_world"]}
-
-
 def usd_scene(
     path: str | Path,
     mi: ModuleType | str,
@@ -310,10 +303,10 @@ def usd_scene(
 ) -> SceneNode:
     """A whole USD file as a dictionary for ``mi.load_dict``.
 
-    Meshes become limit surfaces, or polygons where they are not to be subdivided; with their transforms, instances,
-    materials, lights and the camera. Where the stage has no lights or no camera, it gets those of the studio. Lengths
-    are those of the stage: below 0.01 units, Mitsuba's shadows leak, which `render` avoids by a larger scene. With many
-    lights, `mitsuba_subdivision.weigh_lights` makes the loaded scene sample each by what it adds to the picture.
+    Meshes become limit surfaces, or polygons without a subdivision scheme; with their transforms, instances, materials,
+    lights and the camera. A stage without lights or a camera gets those of the studio. Lengths are those of the stage:
+    below 0.01 units, Mitsuba's shadows leak, which `render` avoids by a larger scene. With many lights,
+    `mitsuba_subdivision.weigh_lights` makes the loaded scene sample each by its contribution to the picture.
 
     Parameters
     ----------
@@ -322,27 +315,27 @@ def usd_scene(
     mi : module or str
         ``mitsuba`` with a variant set, a variant such as ``mitsuba.llvm_ad_rgb``, or its name: that of the scene.
     time : float, optional
-        Time code. By default, each value is the one that does not depend on time, or else its first sample.
+        Time code. By default, values without time, or else first samples.
     camera : str, optional
-        Path of the camera, such as "/World/camera", or its name. By default that of the render settings, or the first.
+        Path or name of the camera, such as "/World/camera". By default that of the render settings, or the first.
     size : (width, height), optional
-        Pixels of the film. By default those of the render settings, or 640 by as many as the camera's aperture has.
+        Pixels of the film. By default those of the render settings, or 640 and the aspect ratio of the aperture.
     spp : int, optional
         Samples per pixel. By default those of the render settings, or 64.
     view : str or (azimuth, elevation)
         View of the studio's camera, if the stage has no camera.
     texture_size : int, optional
-        Pixels along the sides of textures and UDIM tiles at most. Finer ones than the camera shows are halved.
+        Most pixels along the sides of textures and UDIM tiles. Textures that are finer than the picture are halved.
     transparent : bool
-        Whether pictures have alpha and no background, which render settings can ask for, too. The camera sees no
-        environment, no lamps and no backdrop; meshes that emit light it sees.
+        Whether pictures have alpha and no background, which render settings can ask for, too. The camera sees emissive
+        meshes, but no environment, no lamps and no backdrop.
     over : str or Path, optional
         A USD layer that is stronger than the file: materials, lights, cameras, visibility.
     **parameters
         Of every shape ``subdivision``, such as ``tessellation_rate=4`` or ``shading="vertex"``. By default shading is
-        that of ``shading="auto"``, and triangles are as few as the picture shows, about 4 million at most. With exact
-        shading, outlines are a tenth of a pixel away from the surface as this camera sees them; outside groups,
-        triangles adapt to that. Otherwise all are a 32nd of a pixel away, with 8 segments on each edge at most.
+        that of ``shading="auto"``, and triangles are as few as the picture needs, about 4 million at most. With exact
+        shading, outlines are within a tenth of a pixel of the surface in this camera's picture; outside groups,
+        triangles adapt to that. Otherwise all are within a 32nd of a pixel, with 8 segments on each edge at most.
 
     Returns
     -------
@@ -361,7 +354,7 @@ def usd_scene(
     Warns
     -----
     CageWarning
-        About everything that is ignored or unusable, once for each kind.
+        About ignored and unusable parts, once for each kind.
 
     Examples
     --------

@@ -83,14 +83,9 @@ def read_settings(
         changes["shutter"] = [0.0, 0.0]
     if value("disableDepthOfField"):
         changes |= {"lens_radius": 0.0, "focus_distance": 0.0}
-    picture = PictureContents(
-        str(path),
-        size and list(size),
-        np.clip(window or WHOLE, 0, 1).tolist(),
-        bool(value(_TRANSPARENT)),
-        spp,
-        namespaced(prim, "mitsuba:integrator", time),
-    )
+    shown, integrator = np.clip(window or WHOLE, 0, 1).tolist(), namespaced(prim, "mitsuba:integrator", time)
+    resolution = None if size is None else (size[0], size[1])
+    picture = PictureContents(str(path), resolution, shown, bool(value(_TRANSPARENT)), spp, integrator)
     for product in products:
         stem, own = Path(str(value_at(product.GetProductNameAttr(), time))).stem, product.GetPrim().GetName()
         name = own if stem in ("", *picture.products) else stem

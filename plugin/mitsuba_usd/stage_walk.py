@@ -35,6 +35,8 @@ _SINGULAR = "instances with singular transforms are ignored"
 class StageReader:
     """Reader of a stage at several times; if only cameras move, everything else is read once."""
 
+    _is_still = cached_property(lambda self: is_still(self._stage))
+
     def __init__(
         self,
         path: str | Path,
@@ -61,10 +63,6 @@ class StageReader:
                 self._before = walk.contents(self._camera)
                 return self._before
 
-    @cached_property
-    def _is_still(self) -> bool:
-        return is_still(self._stage)
-
     @property
     def moves(self) -> bool:
         """Whether any attribute may vary with time."""
@@ -87,12 +85,9 @@ class StageReader:
 
 def is_still(stage: Usd.Stage) -> bool:
     """Whether nothing but cameras and their rigs may vary with time."""
-
-    def may_move(prim: Usd.Prim) -> bool:
-        below = Usd.PrimRange.AllPrims(prim) if _may_vary(prim) else []
-        return not all(str(part.GetTypeName()) in _OF_RIGS and not part.IsInstance() for part in below)
-
-    return not any(map(may_move, _all_prims(stage)))
+    moving = filter(_may_vary, _all_prims(stage))
+    below = (part for prim in moving for part in Usd.PrimRange.AllPrims(prim))
+    return all(str(part.GetTypeName()) in _OF_RIGS and not part.IsInstance() for part in below)
 
 
 def _all_prims(stage: Usd.Stage) -> Iterator[Usd.Prim]:
@@ -164,10 +159,8 @@ class _StageWalk:
         try:
             return replace(read_camera(cameras[path], to_world, self._code, self._notes), **changes), picture
         except (TypeError, ValueError):
-            raise CageError(
-                f"{self._location(cameras[path])}: the camera is not usable; expected finite numbers, and apertures "
-                "and a focal length above 0"
-            ) from None
+            expected = "finite numbers, and apertures and a focal length above 0"
+            raise CageError(f"{self._location(cameras[path])}: the camera is not usable; expected {expected}") from None
 
     def _location(self, prim: Usd.Prim | UsdGeom.Camera) -> str:
         return f"{self._name}, prim {shortened(str(prim.GetPath()))}"
@@ -196,10 +189,9 @@ class _StageWalk:
         prims = iter(_parts(root))
         for prim in prims:
             imageable = UsdGeom.Imageable(prim)
-            is_hidden = prim != root and prim.GetSpecifier() != Sdf.SpecifierDef
-            if is_hidden or (
-                imageable and files.value_at(imageable.GetVisibilityAttr(), self._code) == UsdGeom.Tokens.invisible
-            ):
+            visibility = imageable and files.value_at(imageable.GetVisibilityAttr(), self._code)
+            is_abstract = prim != root and prim.GetSpecifier() != Sdf.SpecifierDef
+            if is_abstract or visibility == UsdGeom.Tokens.invisible:
                 prims.PruneChildren()
                 continue
             if prim.IsA(UsdGeom.PointInstancer) or (prim.IsInstance() and prim != root):
@@ -301,9 +293,8 @@ class _StageWalk:
             # USD reads beyond the end of arrays that are too short.
             if count != len(kinds) and (count or part == "positions"):
                 raise CageError(f"{location}: there are {count} {part}; expected {len(kinds)}, as many as protoIndices")
-        transforms = instancer.ComputeInstanceTransformsAtTime(
-            time, time, UsdGeom.PointInstancer.IncludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
-        )
+        options = UsdGeom.PointInstancer.IncludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
+        transforms = instancer.ComputeInstanceTransformsAtTime(time, time, *options)
         matrices = to_root @ np.array(transforms).reshape(-1, 4, 4).transpose(0, 2, 1)
         is_shown = np.array(mask, dtype=bool) if mask else np.ones(len(kinds), dtype=bool)
         is_usable = are_invertible(matrices)

@@ -7,6 +7,7 @@ OpenPBR (1.1), UsdPreviewSurface (2.6) and glTF PBR (2.0), as in the library of 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -200,12 +201,8 @@ def gltf_pbr(i: Given) -> dict[str, Input]:
     }
 
 
-def _times(a: Input, b: Input) -> Input:
-    return node("multiply", "color3", in1=a, in2=b)
-
-
-def _powered(a: Input, exponent: Input) -> Input:
-    return node("power", "color3", in1=a, in2=exponent)
+def _color(category: str, a: Input, b: Input) -> Input:
+    return node(category, "color3", in1=a, in2=b)
 
 
 def _mixed(background: Input, foreground: Input, amount: Input, kind: str = "color3") -> Input:
@@ -217,8 +214,7 @@ def number(category: str, a: Input, b: Input) -> Input:
     return node(category, "float", in1=a, in2=b)
 
 
-def _plus(a: Input, b: Input) -> Input:
-    return number("add", a, b)
+_times, _powered, _plus = partial(_color, "multiply"), partial(_color, "power"), partial(number, "add")
 
 
 def _complement(a: Input) -> Input:

@@ -80,11 +80,8 @@ def _joined(tiles: list[NDArray], uv: NDArray[np.int64]) -> TextureImage:
         is_there[row, :, column] = True
     to_uv = np.diag([1 / columns, 1 / rows, 1.0])
     to_uv[:2, 2] = -first / (columns, rows)
-    return TextureImage(
-        pixels.reshape(rows * height, columns * width, channels),
-        to_uv,
-        None if is_there.all() else is_there.reshape(rows * height, columns * width),
-    )
+    mask = None if is_there.all() else is_there.reshape(rows * height, columns * width)
+    return TextureImage(pixels.reshape(rows * height, columns * width, channels), to_uv, mask)
 
 
 def with_alpha(picture: NDArray) -> NDArray:

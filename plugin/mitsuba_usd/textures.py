@@ -22,6 +22,7 @@ from .texture_image import V_DOWN, TextureImage, is_srgb_image, linear_values, r
 # Baked resolution without images, and with large tiled images.
 LEAST_PROCEDURAL, MOST = 1024, 4096
 _PIXELS_AT_ONCE = 1 << 20
+_RAMPS = {"ramplr", "ramptb", "splitlr", "splittb"}
 Image = TextureContents | NodeContents
 # Values (h, w, k), the uppermost row first; and the transform (3, 3) from texture coordinates, whose v points up, to
 # those of the image, from 0 to 1.
@@ -179,7 +180,6 @@ def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float
 
 
 def _selected(pixels: NDArray, channels: list[int]) -> NDArray:
-    """Channels of an image, completed as in `with_alpha`."""
     first, end = channels[0], channels[-1] + 1
     if pixels.shape[2] >= max(3, end):
         return pixels[..., first:end]
@@ -207,7 +207,10 @@ def baked(
     for size, to_uv in zip(sizes, maps, strict=True):
         wanted.append(int(np.ceil(max(size) * np.linalg.norm(to_uv[:2, :2], axis=1).max())))
     edge = min(max(wanted, default=1), MOST)
-    wrap = "repeat" if textures else _procedural_wrap(expression)
+    # Ramps continue with their last value.
+    names = _categories(expression)
+    is_ramp = bool(names & _RAMPS) and not any("noise" in name or "fractal" in name for name in names)
+    wrap = "clamp" if is_ramp and not textures else "repeat"
     return _filled(expression, pictures, (edge, edge)), np.eye(3), wrap
 
 
@@ -258,13 +261,6 @@ def _categories(expression: NodeContents) -> set[str]:
 def samples_elsewhere(expression: NodeContents) -> bool:
     """Whether an expression computes the texture coordinates of an image."""
     return "image" in _categories(expression)
-
-
-def _procedural_wrap(expression: NodeContents) -> str:
-    # Ramps continue with their last value.
-    names = _categories(expression)
-    is_noise = any("noise" in name or "fractal" in name for name in names)
-    return "clamp" if names & {"ramplr", "ramptb", "splitlr", "splittb"} and not is_noise else "repeat"
 
 
 def _looked_up(values: Values, uv: Values, wrap: str) -> Values:

@@ -263,7 +263,7 @@ def test_every_value_of_a_prim_is_its_default_or_else_its_first_sample(stage):
 
     plain, alone = contents("default"), cage("default", [])
     assert {shape.name for shape in plain.shapes} == {"/cube", "/sheet"}
-    assert (plain.camera.focal_length, plain.lights[0].size, plain.picture.resolution) == (70, [2], [20, 10])
+    assert (plain.camera.focal_length, plain.lights[0].size, plain.picture.resolution) == (70, [2], (20, 10))
     assert [len(tags) for tags in (alone.creases, alone.corners, alone.holes)] == [1, 1, 1]
     for stored in ("samples", "both"):
         assert same(contents(stored), plain)

@@ -86,9 +86,7 @@ class Model:
         """Segments per edge for a picture of usual size."""
         return max(2, min(HIGHEST_DEFAULT_RATE, isqrt(QUADS // self.cage.face_count)))
 
-    @cached_property
-    def _frame_table(self) -> VertexTable:
-        return frame_table(self.surface)
+    _frame_table = cached_property(lambda self: frame_table(self.surface))
 
     def limit_points(self, control_points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points ``(n, 3)`` all over the limit surface of these control points."""
@@ -291,7 +289,6 @@ def _in_materials(model: Model, surface: SceneNode, in_memory: bool) -> SceneNod
 
 
 def _material(cage: ControlCage, checker: bool = False) -> SceneNode:
-    """A checkerboard, or the colours at the vertices of a cage, or clay."""
     attributes = cage.attributes
     shown = next((name for name in COLOURS if name in attributes and attributes[name].values.shape[1] == 3), None)
     colour: SceneNode = {"type": "rgb", "value": list(CLAY)}

@@ -92,7 +92,6 @@ def _parsed(library: Path, text: str) -> dict[str, Material]:
 
 
 def _leading_numbers(words: list[str], most: int) -> list[float]:
-    """The first words, as long as they are finite numbers."""
     numbers: list[float] = []
     for word in words[:most]:
         try:
@@ -105,7 +104,6 @@ def _leading_numbers(words: list[str], most: int) -> list[float]:
 
 
 def _texture(folder: Path, text: str, left_out: dict[str, None]) -> SceneNode:
-    """Mitsuba's texture of a map: options and the name of a file, which may have spaces."""
     # The picture is looked up at ``scale * uv + offset``, and its linear values ``c`` become ``base + gain * c``.
     scale, offset, base_and_gain = [1.0, 1.0, 1.0], [0.0, 0.0, 0.0], [0.0, 1.0]
     is_clamped, is_blended = False, True

@@ -186,7 +186,6 @@ def finished(scene: SceneNode, look: Look, up: str) -> SceneNode:
 
 
 def _without_background(scene: SceneNode) -> SceneNode:
-    """A scene whose film has alpha, and whose camera sees neither environment nor lamps."""
     hidden = {**scene["integrator"], "hide_emitters": True}
     if any(map(_is_glowing_mesh, scene.values())):
         hidden = {"type": FOREGROUND, "hidden": hidden, "shown": scene["integrator"]}
