@@ -47,7 +47,6 @@ def radiance(material: MaterialContents, textures: Textures, notes: StageWarning
     emission = material.inputs.get("emission", 0.0)
     if isinstance(emission, PrimvarContents):
         notes.add("emissiveColor from a primvar is ignored", material.name)
-        return None
     if not material.is_emissive:
         return None
     if isinstance(emission, (TextureContents, NodeContents)):

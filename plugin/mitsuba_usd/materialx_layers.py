@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import importlib.util
 import posixpath
-from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,14 +39,6 @@ def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
     identifiers: dict[str, str] = {}
     layers: list[Sdf.Layer] = []  # Keeps the layers alive until the stage is open
 
-    def document(path: str) -> str:
-        """Identifier of the layer of a document; that of the document itself if it is unreadable, so that USD warns."""
-        if path not in identifiers:
-            layer = _layer_of_document(path, name)
-            layers.extend([] if layer is None else [layer])
-            identifiers[path] = path if layer is None else layer.identifier
-        return identifiers[path]
-
     def copied(layer: Sdf.Layer) -> str:
         """Identifier of a layer, or of its copy if it refers to documents."""
         if layer.identifier in identifiers:
@@ -57,7 +48,12 @@ def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
         for path in layer.GetCompositionAssetDependencies():
             absolute = layer.ComputeAbsolutePath(path)
             if path.endswith((_EXTENSION, f"{_EXTENSION}]")):
-                replaced[path] = document(absolute)
+                if absolute not in identifiers:
+                    made = _layer_of_document(absolute, name)
+                    layers.extend([] if made is None else [made])
+                    # USD warns of an unreadable document.
+                    identifiers[absolute] = absolute if made is None else made.identifier
+                replaced[path] = identifiers[absolute]
             elif (below := Sdf.Layer.Find(absolute)) and copied(below) != below.identifier:
                 replaced[path] = copied(below)
         if not replaced:
@@ -96,8 +92,9 @@ def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
             text = bytes(asset.GetBuffer()).decode()
         search = MaterialX.FileSearchPath(str(Path(str(resolved)).parent))
         MaterialX.readFromXmlString(document, text, search)
+        document.setSourceUri(str(resolved))
         for node in document.getMaterialNodes():
-            _Material(stage, node, str(resolved))
+            _add_material(stage, node)
     # Nodes that are built of themselves raise the last error.
     except (MaterialX.ExceptionParseError, MaterialX.Exception, OSError, UnicodeError, RecursionError) as error:
         warn(f"{name}: the MaterialX document {path} cannot be read ({str(error).strip()}); its materials are ignored")
@@ -117,111 +114,110 @@ def _beside(path: str, document: str) -> str:
     return absolute if absolute != path else beside
 
 
-class _Material:
-    def __init__(self, stage: Usd.Stage, node: MaterialX.Node, document: str) -> None:
-        import MaterialX
+def _add_material(stage: Usd.Stage, node: MaterialX.Node) -> None:
+    """Add a material, with shaders that read its inputs."""
+    import MaterialX
 
-        self._stage, self._document = stage, document
-        self._path = stage.GetPrimAtPath("/MaterialX/Materials").GetPath().AppendChild(_prim_name(node.getName()))
-        self._source = node.getDocument()
-        material = UsdShade.Material.Define(stage, self._path)
-        for kind, output in _OUTPUTS.items():
-            for shader in MaterialX.getShaderNodes(node, kind):
-                definition = shader.getNodeDef("", True)
-                if definition is not None:
-                    source = self._add_shader(shader, definition.getName())
-                    material.CreateOutput(f"mtlx:{output}", _sdf_type("token")).GetAttr().AddConnection(source)
+    path = stage.GetPrimAtPath("/MaterialX/Materials").GetPath().AppendChild(_prim_name(node.getName()))
+    material = UsdShade.Material.Define(stage, path)
+    for kind, output in _OUTPUTS.items():
+        for shader in MaterialX.getShaderNodes(node, kind):
+            if (definition := shader.getNodeDef("", True)) is None:
+                continue
+            prim = UsdShade.Shader.Define(stage, path.AppendChild(definition.getName()))
+            prim.CreateIdAttr(definition.getName())
+            for port in shader.getInputs():
+                given = _add_input(material, material.ConnectableAPI(), port, path)
+                prim.CreateInput(given.GetBaseName(), given.GetTypeName()).ConnectToSource(given)
+            out = prim.CreateOutput("out", _sdf_type("token")).GetAttr().GetPath()
+            material.CreateOutput(f"mtlx:{output}", _sdf_type("token")).GetAttr().AddConnection(out)
 
-    def _add_shader(self, shader: MaterialX.Node, name: str) -> Sdf.Path:
-        """Add the shader of a material, which reads the inputs of the material; return the path of its output."""
-        prim = UsdShade.Shader.Define(self._stage, self._path.AppendChild(name))
-        prim.CreateIdAttr(name)
-        material = UsdShade.ConnectableAPI.Get(self._stage, self._path)
-        for port in shader.getInputs():
-            given = self._add_input(material, port, self._path, self._source)
-            prim.CreateInput(given.GetBaseName(), given.GetTypeName()).ConnectToSource(given)
-        return prim.CreateOutput("out", _sdf_type("token")).GetAttr().GetPath()
 
-    def _add_graph(
-        self, graph: Any, path: Sdf.Path, inputs: Iterable[MaterialX.Input], parent: Sdf.Path, container: Any
-    ) -> None:
-        connectable = UsdShade.NodeGraph.Define(self._stage, path).ConnectableAPI()
-        for port in inputs:
-            self._add_input(connectable, port, parent, container)
-        for node in graph.getNodes():
-            self._add_node(node, path, graph)
-        for output in graph.getOutputs():
-            port = connectable.CreateOutput(_prim_name(output.getName()), _sdf_type(output.getType()))
-            self._connect(port.GetAttr(), output, path, graph)
+def _add_graph(material: UsdShade.Material, graph: Any, path: Sdf.Path, inputs: list[Any], parent: Sdf.Path) -> None:
+    connectable = UsdShade.NodeGraph.Define(material.GetPrim().GetStage(), path).ConnectableAPI()
+    for port in inputs:
+        _add_input(material, connectable, port, parent)
+    for node in graph.getNodes():
+        _add_node(material, node, path)
+    for output in graph.getOutputs():
+        port = connectable.CreateOutput(_prim_name(output.getName()), _sdf_type(output.getType()))
+        _connect(material, port.GetAttr(), output, path)
 
-    def _add_node(self, node: MaterialX.Node, parent: Sdf.Path, container: Any) -> Sdf.Path:
-        """Add a node, as a graph if the document defines it by one; return its path."""
-        import MaterialX
 
-        path = parent.AppendChild(_prim_name(node.getName()))
-        if self._stage.GetPrimAtPath(path):
-            return path
-        definition = node.getNodeDef("", True)
-        name = "" if definition is None else definition.getName()
-        implementation = None if definition is None else definition.getImplementation()
-        if isinstance(implementation, MaterialX.NodeGraph) and library().getNodeDef(name) is None:
-            given = {port.getName() for port in node.getInputs()}
-            others = [port for port in definition.getActiveInputs() if port.getName() not in given]
-            self._add_graph(implementation, path, (*others, *node.getInputs()), parent, container)
-            return path
-        shader = UsdShade.Shader.Define(self._stage, path)
-        shader.CreateIdAttr(name or node.getCategory())
-        for output in [] if definition is None else definition.getActiveOutputs():
-            shader.CreateOutput(output.getName(), _sdf_type(output.getType()))
-        for port in node.getInputs():
-            self._add_input(shader.ConnectableAPI(), port, parent, container)
+def _add_node(material: UsdShade.Material, node: MaterialX.Node, parent: Sdf.Path) -> Sdf.Path:
+    """Add a node, as a graph if the document defines it by one; return its path."""
+    import MaterialX
+
+    stage, path = material.GetPrim().GetStage(), parent.AppendChild(_prim_name(node.getName()))
+    if stage.GetPrimAtPath(path):
         return path
+    definition = node.getNodeDef("", True)
+    name = "" if definition is None else definition.getName()
+    implementation = None if definition is None else definition.getImplementation()
+    if isinstance(implementation, MaterialX.NodeGraph) and library().getNodeDef(name) is None:
+        given = {port.getName() for port in node.getInputs()}
+        others = [port for port in definition.getActiveInputs() if port.getName() not in given]
+        _add_graph(material, implementation, path, [*others, *node.getInputs()], parent)
+        return path
+    shader = UsdShade.Shader.Define(stage, path)
+    shader.CreateIdAttr(name or node.getCategory())
+    for output in [] if definition is None else definition.getActiveOutputs():
+        shader.CreateOutput(output.getName(), _sdf_type(output.getType()))
+    for port in node.getInputs():
+        _add_input(material, shader.ConnectableAPI(), port, parent)
+    return path
 
-    def _add_input(self, connectable: Any, given: MaterialX.Input, parent: Sdf.Path, container: Any) -> Any:
-        port = connectable.CreateInput(_prim_name(given.getName()), _sdf_type(given.getType()))
-        if not self._connect(port.GetAttr(), given, parent, container):
-            self._set(port.GetAttr(), given)
-        return port
 
-    def _connect(self, attribute: Usd.Attribute, port: Any, parent: Sdf.Path, container: Any) -> bool:
-        """Connect an attribute as a port of MaterialX; return whether the port has a connection."""
-        output = port.getOutputString() or "out"
-        if port.hasInterfaceName():
-            attribute.AddConnection(parent.AppendProperty(f"inputs:{_prim_name(port.getInterfaceName())}"))
-            return True
-        if port.getNodeGraphString():
-            graph = self._source.getNodeGraph(port.getNodeGraphString())
-            if graph is None:
-                return False
-            path = self._path.AppendChild(_prim_name(graph.getName()))
-            if not self._stage.GetPrimAtPath(path):
-                self._add_graph(graph, path, graph.getInputs(), self._path, self._source)
-            if not port.getOutputString() and graph.getOutputs():
-                output = graph.getOutputs()[0].getName()
-        else:
-            node = container.getNode(port.getNodeName()) if port.getNodeName() else None
-            if node is None:
-                return False
-            path = self._add_node(node, parent, container)
-        attribute.AddConnection(path.AppendProperty(f"outputs:{_prim_name(output)}"))
+def _add_input(material: UsdShade.Material, connectable: Any, given: Any, parent: Sdf.Path) -> Any:
+    port = connectable.CreateInput(_prim_name(given.getName()), _sdf_type(given.getType()))
+    if not _connect(material, port.GetAttr(), given, parent):
+        _set(port.GetAttr(), given)
+    return port
+
+
+def _connect(material: UsdShade.Material, attribute: Usd.Attribute, port: Any, parent: Sdf.Path) -> bool:
+    """Connect an attribute as a port of MaterialX; return whether the port has a connection."""
+    output = port.getOutputString() or "out"
+    if port.hasInterfaceName():
+        attribute.AddConnection(parent.AppendProperty(f"inputs:{_prim_name(port.getInterfaceName())}"))
         return True
+    if port.getNodeGraphString():
+        graph = port.getDocument().getNodeGraph(port.getNodeGraphString())
+        if graph is None:
+            return False
+        path = material.GetPath().AppendChild(_prim_name(graph.getName()))
+        if not material.GetPrim().GetStage().GetPrimAtPath(path):
+            _add_graph(material, graph, path, graph.getInputs(), material.GetPath())
+        if not port.getOutputString() and graph.getOutputs():
+            output = graph.getOutputs()[0].getName()
+    else:
+        # Outputs belong to the graph of their nodes, inputs to a node of it.
+        graph = port.getParent() if port.getCategory() == "output" else port.getParent().getParent()
+        node = graph.getNode(port.getNodeName()) if port.getNodeName() else None
+        if node is None:
+            return False
+        path = _add_node(material, node, parent)
+    attribute.AddConnection(path.AppendProperty(f"outputs:{_prim_name(output)}"))
+    return True
 
-    def _set(self, attribute: Usd.Attribute, given: MaterialX.Input) -> None:
-        kind, text = given.getType(), given.getValueString()
-        if not text:
-            return
-        if kind == "filename":
-            # Some documents repeat their file prefix in the name.
-            files = [_beside(path, self._document) for path in (given.getResolvedValueString(), text)]
-            attribute.Set(Sdf.AssetPath(next(filter(Ar.GetResolver().Resolve, files), files[0])))
-        elif kind == "string":
-            attribute.Set(text)
-        elif kind in _TYPES:
-            value, type_of_usd = given.getValue(), type(attribute.GetTypeName().defaultValue)
-            attribute.Set(value if isinstance(value, (bool, int, float)) else type_of_usd(*value))
-        space = given.getActiveColorSpace()
-        if space and kind in ("filename", "color3", "color4"):
-            attribute.SetColorSpace(space)
+
+def _set(attribute: Usd.Attribute, given: MaterialX.Input) -> None:
+    kind, text = given.getType(), given.getValueString()
+    if not text:
+        return
+    if kind == "filename":
+        # Some documents repeat their file prefix in the name.
+        names, document = (given.getResolvedValueString(), text), given.getDocument().getSourceUri()
+        files = [_beside(name, document) for name in names]
+        attribute.Set(Sdf.AssetPath(next(filter(Ar.GetResolver().Resolve, files), files[0])))
+    elif kind == "string":
+        attribute.Set(text)
+    elif kind in _TYPES:
+        value, type_of_usd = given.getValue(), type(attribute.GetTypeName().defaultValue)
+        attribute.Set(value if isinstance(value, (bool, int, float)) else type_of_usd(*value))
+    space = given.getActiveColorSpace()
+    if space and kind in ("filename", "color3", "color4"):
+        attribute.SetColorSpace(space)
 
 
 def _sdf_type(kind: str) -> Sdf.ValueTypeName:

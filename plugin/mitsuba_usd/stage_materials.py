@@ -90,12 +90,9 @@ class MaterialReader:
 
     def bound(self, prim: Usd.Prim) -> MaterialContents | None:
         """The material bound to a prim; None without a supported one."""
-        for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
-            material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)[0]
-            contents = self._material(material) if material else None
-            if contents is not None:
-                return contents
-        return None
+        bindings, purposes = UsdShade.MaterialBindingAPI(prim), (UsdShade.Tokens.full, UsdShade.Tokens.preview)
+        found = (material for purpose in purposes if (material := bindings.ComputeBoundMaterial(purpose)[0]))
+        return next((contents for contents in map(self._material, found) if contents is not None), None)
 
     def _material(self, material: UsdShade.Material) -> MaterialContents | None:
         """The contents of a material, the same for equal materials; None if it is not supported."""

@@ -71,9 +71,7 @@ class StageReader:
     def dark_lights(self) -> str:
         """Lights that do not shine, with the reason of each."""
         reasons = []
-        for prim in _all_prims(self._stage):
-            if not prim.HasAPI(UsdLux.LightAPI):
-                continue
+        for prim in (prim for prim in _all_prims(self._stage) if prim.HasAPI(UsdLux.LightAPI)):
             if not prim.IsActive():
                 reasons.append(f"{prim.GetPath()} is inactive")
             elif UsdGeom.Imageable(prim).ComputeVisibility() == UsdGeom.Tokens.invisible:

@@ -141,8 +141,7 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return vectors / np.where(lengths > 0, lengths, 1)
 
 
-# Model and control points ``(n, 3)`` of a frame.
-PosedModel = tuple[Model, NDArray[np.float64]]
+PosedModel = tuple[Model, NDArray[np.float64]]  # Model and control points (n, 3) of a frame
 
 
 class CageScenes(SceneSource[PosedModel]):
