@@ -58,7 +58,7 @@ class PrimvarContents:
 
 
 class MaterialError(ValueError):
-    """A material that cannot be read, with the reason."""
+    """Reason why a material cannot be read."""
 
 
 Part = TypeVar("Part", "ShapeContents", "LightContents")
@@ -143,14 +143,14 @@ class ShapeContents:
 
 @dataclass(frozen=True, eq=False)
 class InstanceContents:
-    """A group of shapes, placed in the world."""
+    """A group of shapes with a place in the world."""
 
     name: str
     group: int
     to_world: NDArray
 
     def placed(self, part: Part) -> Part:
-        """A part of the group where the instance is."""
+        """A shape or light of the group, in the place of the instance."""
         return replace(part, name=f"{self.name}{part.name}", to_world=self.to_world @ part.to_world)
 
 
@@ -247,5 +247,5 @@ class SceneContents:
 
     @property
     def has_surfaces(self) -> bool:
-        """Whether there are meshes to be subdivided."""
+        """Whether there are limit surfaces."""
         return any(shape.cage.scheme is not None for shape in self.all_shapes)

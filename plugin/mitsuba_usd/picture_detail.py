@@ -155,10 +155,9 @@ def rate_of_heights(cage: CageContents, texture: SceneNode, error: float) -> int
 
 def with_own_parameters(
     contents: SceneContents,
-    chosen: Mapping[ShapeContents, dict[str, Any]],  # Parameters of some limit surfaces
-    parameters: dict[str, Any],  # Parameters of the others; their displacement replaces those of materials
-    # Sensors that see the heights; empty if any sensor may, None to keep the rates
-    sensors: Sequence[SceneNode] | None,
+    chosen: Mapping[ShapeContents, dict[str, Any]],  # Of some limit surfaces
+    parameters: dict[str, Any],  # Of other limit surfaces; a displacement replaces the displacements of materials
+    sensors: Sequence[SceneNode] | None,  # Sensors of the pictures; empty if they are unknown, None to keep the rates
     textures: Textures,
     notes: StageWarnings,
 ) -> dict[ShapeContents, dict[str, Any]]:

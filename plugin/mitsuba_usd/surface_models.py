@@ -120,7 +120,7 @@ def open_pbr_surface(i: Given) -> dict[str, Input]:
         "transmission": i("transmission_weight"),
         **_colors_of_depth(i("transmission_color"), i("transmission_depth")),
         "thin": i("geometry_thin_walled"),
-        # Half of what a sheet scatters goes through.
+        # A sheet transmits half of the scattered light.
         "translucency": number("multiply", number("multiply", i("geometry_thin_walled"), i("subsurface_weight")), 0.5),
         "coat": coat,
         "coat_roughness": i("coat_roughness"),

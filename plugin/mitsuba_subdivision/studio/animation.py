@@ -120,8 +120,8 @@ class Turntable:
     """A cage or a stage that turns once, in frames 1 to ``count``, around the middle of its bounds.
 
     In Mitsuba the model stands still: the camera turns around it the other way, with the lights and the backdrop of the
-    studio. The studio's camera sees all of it in all frames. Frame 1 is the still picture; in the next ones, what is
-    shown is turned counter-clockwise, seen from above, with its own lights.
+    studio. The studio's camera sees the whole model in all frames. Frame 1 is the still picture; in later frames, the
+    model and its own lights are turned counter-clockwise, seen from above.
     """
 
     def __init__(self, source: SceneSource[Any], count: int, *, follows_sensor: bool = True) -> None:

@@ -61,7 +61,7 @@ def _file(folder: Path, name: str) -> Path:
 
 
 def _without_comment(line: str) -> str:
-    """A line without its comment; a name may have a "#" in it, but for one between spaces."""
+    """A line without its comment, which begins with "#" at the start or between spaces."""
     return re.sub(r"(^#|\s#(?=\s|$)).*", "", line.strip()).strip()
 
 
@@ -169,7 +169,7 @@ def material_bsdf(material: Material, name: str) -> SceneNode:
 
 
 def material_emitter(material: Material) -> SceneNode | None:
-    """The emitter of a material that shines; None if it does not."""
+    """The emitter of an emissive material; None for others."""
     radiance = _numbers(material, "Ke", 0.0, 0.0, 0.0)
     return {"type": "area", "radiance": {"type": "rgb", "value": radiance}} if max(radiance) > 0 else None
 

@@ -202,7 +202,7 @@ class _SceneParts:
 
 
 def _contents(entry: SceneNode) -> CageContents:
-    """The cage described by properties of the shape ``subdivision``, without its scheme, which the scene keeps."""
+    """The cage of properties of the shape ``subdivision``, without its scheme, which the scene keeps."""
     arrays = {key: np.array(entry[key]) for key in _ARRAYS if key in entry}
     rules = {key: entry[key] for key in RULES if key in entry}
     data = read_attributes(entry)

@@ -205,9 +205,8 @@ def framed(
     elevation: float,
     size: tuple[int, int],  # (width, height)
 ) -> tuple[NDArray[np.float64], float]:
-    """Place a camera so that points just fit into its image, centred, but for `MARGIN`.
+    """Place a camera so that points fill its image, centred, within `MARGIN`, unless they are deeper than wide.
 
-    Points that are deeper than they are wide are smaller than that, as the camera keeps away from them.
     Returns its place in the studio's axes, and its distance from the middle of the points, along the view.
     """
     axes = camera_axes(azimuth, elevation)
@@ -224,16 +223,16 @@ def framed(
 
 
 def outermost(points: NDArray[np.float64], up: str, view: View, size: tuple[int, int]) -> NDArray[np.float64]:
-    """The few of points in the world that determine the camera of `framed`, and the bounds of all points."""
+    """Subset of points in the world with the same camera of `framed`, and the same bounds."""
     x, y = _slopes(size)
-    # Away from each side of what the camera sees, then along its view and along the axes.
+    # Normals of the sides of the view frustum, its direction, and the axes.
     towards = np.array([[1, 0, -x], [-1, 0, -x], [0, 1, -y], [0, -1, -y], [0, 0, 1], [0, 0, -1]])
     directions = np.concatenate([towards @ camera_axes(*angles_of(view)).T, np.eye(3), -np.eye(3)])
     return points[np.unique((points @ studio_axes(up) @ directions.T).argmax(axis=0))]
 
 
 def _slopes(size: tuple[int, int]) -> NDArray[np.float64]:
-    """Half extents of what points may fill per unit of depth, horizontally and vertically."""
+    """Half extents of the view frustum within its margin, per unit of depth, horizontally and vertically."""
     return np.tan(np.radians(FIELD_OF_VIEW / 2)) * np.array(size) / max(size) * (1 - 2 * MARGIN)
 
 
@@ -282,7 +281,7 @@ def turned(azimuth: float) -> NDArray[np.float64]:
 def sampler(spp: int) -> SceneNode:
     """Well-spread samples of a pixel, at least so many, as for ``mi.load_dict``.
 
-    They fill a grid: 32 become 35, as 5 times 7, what Mitsuba would make them with a warning.
+    They fill a grid: 32 become 35, as 5 times 7; Mitsuba would do so with a warning.
     """
     rows = math.isqrt(spp)
     return {"type": "multijitter", "sample_count": -(-spp // rows) * rows}
