@@ -22,7 +22,7 @@ _MOST_ETA = 1000.0  # Largest index of refraction; nearly all light is reflected
 _COAT = 0.04  # Reflectance of the coat of `principled` at normal incidence
 _MIRROR = 0.001  # Width of the narrowest lobe of `principled`, at the limit of float32; narrower lobes are mirrors
 _LEAST_ETA = 1.001  # With an index of 1, `principled` loses its metal
-# Inputs that Mitsuba's BSDFs need between 0 and 1; images and primvars are as they are.
+# Inputs that Mitsuba's BSDFs need between 0 and 1; plain images and primvars are kept.
 _FRACTIONS = ("roughness", "metalness", "transmission", "opacity")
 _RAW = ("normalmap", "bumpmap")  # Textures of Mitsuba's BSDFs that are no colours
 _DEEPEST = 24  # Vertices of paths through glass: in and out of a shell twice, with reflections between
@@ -137,10 +137,10 @@ class _Surface:
             problem = str(error)
         plugin, unknown = re.search(r'plugin of type "(\w+)"', problem), re.findall(r'\n  - \w+ "(.+?)":', problem)
         if plugin and unknown:
-            self._leave(f"parameters that Mitsuba's {plugin[1]} does not have are ignored ({', '.join(unknown)})")
+            self._note(f"parameters that Mitsuba's {plugin[1]} does not have are ignored ({', '.join(unknown)})")
             self._lacking |= {(plugin[1], name) for name in unknown}
             return self._loadable(given, kind)
-        self._leave(f"nodes that Mitsuba cannot load are ignored ({problem.rpartition('] ')[2].splitlines()[0]})")
+        self._note(f"nodes that Mitsuba cannot load are ignored ({problem.rpartition('] ')[2].splitlines()[0]})")
         return None
 
     def number(self, given: Input) -> SceneNode | float:
@@ -160,7 +160,7 @@ class _Surface:
     def _is(self, name: str, value: float) -> bool:
         return is_all(self._inputs[name], value)
 
-    def _leave(self, what: str) -> None:
+    def _note(self, what: str) -> None:
         self._notes.add(what, self._shape.name if self._material is None else self._material.name)
 
     def bsdf(self) -> SceneNode:
@@ -179,13 +179,13 @@ class _Surface:
         if is_constant(weight) and _first(weight) <= 0:
             entry = self._opaque()
         elif is_constant(weight) and _first(weight) >= 1:
-            entry = self._turned(self._glass(), is_diffuse=False)
+            entry = self._with_normal_map(self._glass(), is_diffuse=False)
         else:
-            parts = {"bsdf_0": self._opaque(), "bsdf_1": self._turned(self._glass(), is_diffuse=False)}
+            parts = {"bsdf_0": self._opaque(), "bsdf_1": self._with_normal_map(self._glass(), is_diffuse=False)}
             entry = {"type": "blendbsdf", "weight": self.number(weight), **parts}
         return _masked(entry, self.number(self._inputs["opacity"]))
 
-    def _turned(self, bsdf: SceneNode, *, is_diffuse: bool = True) -> SceneNode:
+    def _with_normal_map(self, bsdf: SceneNode, *, is_diffuse: bool = True) -> SceneNode:
         """A BSDF with the normal map, if there is one."""
         normal = self._for_shape(self._inputs.get("normal", 0.0))
         normals = self._textures.normals(normal) if isinstance(normal, (TextureContents, NodeContents)) else None
@@ -198,14 +198,14 @@ class _Surface:
 
     def _opaque(self) -> SceneNode:
         if not self._is("translucency", 0):
-            return self._turned(self._sheet(0.0))
+            return self._with_normal_map(self._sheet(0.0))
         is_bare = self._is("coat", 0) and self._is("sheen", 0)
         if is_bare and self._is("metalness", 1) and is_constant(self._inputs["base_color"]):
-            return _both_sides(self._turned(self._metal(), is_diffuse=False))
+            return _both_sides(self._with_normal_map(self._metal(), is_diffuse=False))
         if is_bare and self._is("metalness", 0) and (self._is("specular", 0) or self._is("specular_color", 0)):
             diffuse = {"type": "diffuse", "reflectance": self._color(self._inputs["base_color"])}
-            return _both_sides(self._turned(diffuse))
-        return _both_sides(self._turned(self._principled()))
+            return _both_sides(self._with_normal_map(diffuse))
+        return _both_sides(self._with_normal_map(self._principled()))
 
     def _principled(self) -> SceneNode:
         inputs = self._inputs
@@ -217,7 +217,7 @@ class _Surface:
             "metallic": self.number(inputs["metalness"]),
         }
         if not (self._is("metalness", 0) or has_white_edges(inputs["base_color"], inputs["edge_color"])):
-            self._leave("edge colours of metals with textures, coats or other layers are ignored; the edges are white")
+            self._note("edge colours of metals with textures, coats or other layers are ignored; the edges are white")
         ratio = self._ratio()
         if ratio is not None:
             rest = node("invert", "float", in_=ratio, amount=1.0)  # The ratio of widths is 1 - 0.9 anisotropic
@@ -231,14 +231,14 @@ class _Surface:
             brightness = float(color @ LUMINANCE)
             entry["sheen"] = self.number(number("multiply", inputs["sheen"], brightness))
             if np.ptp(color) > 0:
-                self._leave("colours of sheen only set its brightness; it is white")
+                self._note("colours of sheen only set its brightness; it is white")
         return entry
 
     def _gloss(self) -> SceneNode | float:
         """``clearcoat_gloss`` of a roughness, whose square is the width of the lobe."""
         roughness = self._inputs["coat_roughness"]
         if np.any(np.square(self._mean("coat_roughness")) > _DULL):
-            self._leave(f"coats rougher than {_DULL**0.5:.2f} are rendered with that roughness")
+            self._note(f"coats rougher than {_DULL**0.5:.2f} are rendered with that roughness")
         width = number("multiply", roughness, roughness)
         gloss = node("divide", "float", in1=node("invert", "float", in_=width, amount=_DULL), in2=_DULL - _GLOSSY)
         return self.number(node("clamp", "float", in_=gloss, low=0.0, high=1.0))
@@ -285,16 +285,16 @@ class _Surface:
     def _reflectance(self, name: str) -> float:
         eta = max(_first(self._mean(name)), 0.0)
         if not is_constant(self._inputs[name]):
-            self._leave("textures of indices of refraction are replaced by their means")
+            self._note("textures of indices of refraction are replaced by their means")
         return ((eta - 1) / (eta + 1)) ** 2
 
     def _eta(self) -> float:
         """Index of refraction with the reflectance of the specular layer; colours count by their luminance."""
         color = np.broadcast_to(self._mean("specular_color"), (3,))
         if np.ptp(color) > 0 and not self._is("metalness", 1):
-            self._leave("specularColor and specular_color only set the brightness of reflections, which are white")
+            self._note("specularColor and specular_color only set the brightness of reflections, which are white")
         if not (is_constant(self._inputs["specular"]) and is_constant(self._inputs["specular_color"])):
-            self._leave("textures of specular weights and colours are replaced by their means")
+            self._note("textures of specular weights and colours are replaced by their means")
         factor = _first(self._mean("specular")) * float(color @ LUMINANCE)
         root = np.sqrt(np.clip(self._reflectance("ior") * factor, 0, 0.998))
         return float((1 + root) / (1 - root))
@@ -307,7 +307,7 @@ class _Surface:
         ratio = number("max", ratio, 0.02)
         quarters = _first(self._mean("rotation")) * 4
         if abs(quarters - round(quarters)) > 0.01 or not is_constant(self._inputs["rotation"]):
-            self._leave("rotations of anisotropy are rounded to quarter turns")
+            self._note("rotations of anisotropy are rounded to quarter turns")
         return number("divide", 1.0, ratio) if round(quarters) % 2 else ratio
 
     def _widths(self) -> SceneNode | None:

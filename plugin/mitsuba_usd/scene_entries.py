@@ -93,12 +93,12 @@ def scene_entries(
     def shown(shape: ShapeContents) -> SceneNode | mi.Object | None:
         """A shape; None, with a warning, if it is unusable."""
         try:
-            shining = None if shape.radiance is None else rgb(np.array(shape.radiance) / _light_area(shape))
-            if shining is None and shape.material is not None:
-                shining = radiance(shape.material, textures, notes)
-            if shining is not None and shape.curves is not None:
+            emitted = None if shape.radiance is None else rgb(np.array(shape.radiance) / _light_area(shape))
+            if emitted is None and shape.material is not None:
+                emitted = radiance(shape.material, textures, notes)
+            if emitted is not None and shape.curves is not None:
                 notes.add("emission of curves is ignored; Mitsuba's curves are no lights", shape.name)
-            area = None if shining is None else {"type": "area", "radiance": shining}
+            area = None if emitted is None else {"type": "area", "radiance": emitted}
             return made(shape, area)
         except SchemeError as error:
             notes.add_message(f"{error}; the mesh is shown as polygons", shape.name)
@@ -287,7 +287,7 @@ class LoadedShapes:
         self._counts[shape.name] += 1
         key = shape.name, self._counts[shape.name]
         known = self._before.get(key)
-        is_there = (
+        stays = (
             known is not None
             and np.array_equal(known[0].to_world, shape.to_world)
             and np.array_equal(known[0].cage.positions, shape.cage.positions)
@@ -296,11 +296,11 @@ class LoadedShapes:
             known is None
             or not same(known[0], shape, _MOVABLE)
             or not same_topology(known[0].cage, shape.cage)
-            or (shape.cage.scheme is None and not is_there)
+            or (shape.cage.scheme is None and not stays)
         ):
             # The cage is validated before the BSDF is made, so that warnings name the prim.
             known = shape, self._loaded(shape.material, entry({}), bsdf)
-        elif not is_there:
+        elif not stays:
             positions = np.asarray(shape.cage.positions, dtype=np.float64)
             if not np.isfinite(positions).all():
                 raise CageError(f"{shape.cage.source.name}: points are not finite; expected finite numbers")

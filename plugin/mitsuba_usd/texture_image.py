@@ -42,7 +42,7 @@ class TextureImage:
 
     pixels: NDArray  # (h, w, channels): as in the file, the uppermost row first; 0 where a tile is missing
     to_uv: NDArray[np.float64]  # (3, 3): from texture coordinates to those of the image, from 0 to 1, v up
-    is_there: NDArray[np.bool_] | None = None  # (h, w): mask of existing tiles; None without missing tiles
+    has_tile: NDArray[np.bool_] | None = None  # (h, w): mask of existing tiles; None without missing tiles
 
 
 def read_texture_image(
@@ -69,7 +69,7 @@ def _joined(tiles: list[NDArray], uv: NDArray[np.int64]) -> TextureImage:
     height, width, channels = np.max([tile.shape for tile in tiles], axis=0)
     dtype = max((tile.dtype for tile in tiles), key=lambda dtype: (dtype.kind == "f", dtype.itemsize))
     pixels = np.zeros((rows, height, columns, width, channels), dtype=dtype)
-    is_there = np.zeros((rows, height, columns, width), dtype=bool)
+    has_tile = np.zeros((rows, height, columns, width), dtype=bool)
     for (column, above), of_file in zip(uv - first, tiles, strict=True):
         row = rows - 1 - above
         tile = of_file if of_file.shape[2] == channels else with_alpha(of_file)[..., :channels]
@@ -77,10 +77,10 @@ def _joined(tiles: list[NDArray], uv: NDArray[np.int64]) -> TextureImage:
             values = _resampled(tile.astype(np.float32) / np.float32(_full(tile.dtype)), (height, width))
             tile = (values if dtype.kind == "f" else np.rint(values * _full(dtype))).astype(dtype)
         pixels[row, :, column] = tile
-        is_there[row, :, column] = True
+        has_tile[row, :, column] = True
     to_uv = np.diag([1 / columns, 1 / rows, 1.0])
     to_uv[:2, 2] = -first / (columns, rows)
-    mask = None if is_there.all() else is_there.reshape(rows * height, columns * width)
+    mask = None if has_tile.all() else has_tile.reshape(rows * height, columns * width)
     return TextureImage(pixels.reshape(rows * height, columns * width, channels), to_uv, mask)
 
 

@@ -55,7 +55,7 @@ class Textures:
         """A texture of colours, up to 1 unless of radiance, or the fallback of an unreadable image."""
         if isinstance(given, TextureContents) and is_raw and given.color_space == "auto":
             given = replace(given, color_space="raw")
-        use, picture = self._used(given)
+        use, picture = self._image_of(given)
         most = None if is_radiance else 1.0
         if picture is None:
             return {"type": "rgb", "value": np.clip(np.broadcast_to(fallback_of(use), (3,)), 0, most).tolist()}
@@ -65,14 +65,14 @@ class Textures:
 
     def number(self, given: Image) -> SceneNode | float:
         """A texture of numbers, or the fallback of an unreadable image."""
-        use, picture = self._used(given)
+        use, picture = self._image_of(given)
         if picture is None:
             return float(fallback_of(use)[0])
         return self._bitmap(replace(use, channel=use.channel[0]), picture, is_raw=True)
 
     def normals(self, given: Image) -> SceneNode | None:
         """A texture of normals, from 0 to 1 as in Mitsuba; None for an unreadable image."""
-        use, picture = self._used(given)
+        use, picture = self._image_of(given)
         if picture is None:
             return None
         if picture.pixels.dtype == np.uint8 and use.scale[:2] == [1.0, 1.0] and use.bias[:2] == [0.0, 0.0]:
@@ -84,12 +84,12 @@ class Textures:
 
     def mean(self, given: Image) -> NDArray[np.float64]:
         """Mean of a texture's values, ``(k,)``."""
-        use, picture = self._used(given)
+        use, picture = self._image_of(given)
         if picture is None:
             return np.asarray(fallback_of(use), dtype=np.float64)
         return np.asarray(_values(picture, use).mean(axis=(0, 1), dtype=np.float64))
 
-    def _used(self, given: Image) -> tuple[TextureContents, TextureImage | None]:
+    def _image_of(self, given: Image) -> tuple[TextureContents, TextureImage | None]:
         """A texture and its image, None if unreadable; of an expression, its baked image."""
         if isinstance(given, TextureContents):
             return given, self._picture(given.file, given.color_space)
@@ -125,7 +125,7 @@ class Textures:
         is_decoded = is_srgb_image(pixels, texture.color_space) and channels != [3]
         is_same = all(texture.scale[k] == 1 and texture.bias[k] == 0 for k in channels)
         key = texture.file, texture.channel, is_decoded
-        if pixels.dtype != np.uint8 or not is_same or picture.is_there is not None or (is_decoded and is_raw):
+        if pixels.dtype != np.uint8 or not is_same or picture.has_tile is not None or (is_decoded and is_raw):
             bitmap = _linear_bitmap(_values(picture, texture))
         else:
             if key not in self._bitmaps:
@@ -145,8 +145,8 @@ class Textures:
     def _keep(self, key: tuple[str, str | None], picture: TextureImage | Exception) -> None:
         if isinstance(picture, Exception):
             # The text of OSError repeats the path.
-            said = (isinstance(picture, OSError) and picture.strerror) or str(picture).strip()
-            reason = said.splitlines()[-1] if said else type(picture).__name__
+            text = (isinstance(picture, OSError) and picture.strerror) or str(picture).strip()
+            reason = text.splitlines()[-1] if text else type(picture).__name__
             self._notes.add("images that cannot be read are replaced by their fallback", f"{key[0]}: {reason}")
         self._pictures[key] = None if isinstance(picture, Exception) else picture
 
@@ -174,8 +174,8 @@ def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float
     scale, bias, fallback = numbers[:, channels]
     if (scale != 1).any() or (bias != 0).any():
         values = values * scale + bias
-    if picture.is_there is not None:
-        values[~picture.is_there] = fallback
+    if picture.has_tile is not None:
+        values[~picture.has_tile] = fallback
     return values
 
 

@@ -502,7 +502,7 @@ def test_tiles_of_all_kinds_make_one_picture(tmp_path):
     mi.Bitmap(np.full((4, 6, 3), [0.25, 2, -1], np.float32)).write(str(tmp_path / "a_1003.exr"))
     image = read_texture_image(str(tmp_path / "a_<UDIM>.exr"))
     assert image.pixels.shape == (4, 18, 3)
-    np.testing.assert_array_equal(image.is_there, np.repeat([[True, False, True]], 6, axis=1).repeat(4, axis=0))
+    np.testing.assert_array_equal(image.has_tile, np.repeat([[True, False, True]], 6, axis=1).repeat(4, axis=0))
     np.testing.assert_allclose(image.pixels[:, 12:], np.broadcast_to([0.25, 2, -1], (4, 6, 3)))
     assert (np.diff(image.pixels[0, :6, 0].astype(float)) >= 0).all()
     np.testing.assert_allclose(image.pixels[:, [0, 5]], np.broadcast_to([[[0], [1]]], (4, 2, 3)), atol=1e-3)
