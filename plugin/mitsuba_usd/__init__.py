@@ -1,20 +1,21 @@
-"""Whole USD files as scenes of Mitsuba, subdivided where they ask for it.
+"""Whole USD files as scenes of Mitsuba, with meshes subdivided by their schemes.
 
 Meshes, cameras, lights, and materials of MaterialX and of UsdPreviewSurface become entries of a scene dictionary.
 The package needs nothing of `mitsuba_subdivision` but its public names.
 
-stage_walk.py, stage_*.py    read a stage to plain data; stage_warnings.py gives warnings, one for each kind
-materialx_layers.py          the USD layers and the node library of MaterialX
-contents.py                  the plain data
-surface_models.py            models of surfaces, by the inputs that all share
-materialx_nodes.py           nodes of MaterialX, evaluated to numbers or pictures
+Data flows one way, from a stage to contents to scene entries.
+
+stage_walk.py, stage_*.py    a stage as contents; stage_warnings.py issues one warning for each kind of problem
+materialx_layers.py          USD layers and node library of MaterialX
+contents.py                  contents: numbers, names and arrays
+surface_models.py            inputs of all models of surfaces in terms of one
+materialx_nodes.py           expressions of nodes of MaterialX, and their values
 scaling.py                   contents in a larger unit
-copies.py                    replaces many instances by meshes
-own_parameters.py           displacements and rates of single shapes
-picture_detail.py            triangles and pixels of textures that a picture needs
-bsdfs.py, textures.py, texture_image.py, emitters.py, sensors.py   build scene entries from the data
-scene_entries.py             shapes, and all entries, for one scene or for frames
-stage_scenes.py              all of it, at one time or in frames
+copies.py                    contents with meshes in place of many instances
+picture_detail.py            triangles, rates of displacements and pixels of textures that a picture needs
+bsdfs.py, textures.py, texture_image.py, emitters.py, sensors.py   scene entries of parts of contents
+scene_entries.py             scene entries of shapes, and of all contents
+stage_scenes.py              scenes at one time or in frames
 """
 
 from .stage_scenes import StageScenes, usd_scene

@@ -11,36 +11,28 @@ from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import ArrayLike, NDArray
 
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
-from .materialx_nodes import LUMINANCE, constant, is_all, is_constant, node, width_of
+from .materialx_nodes import LUMINANCE, PLUGIN, constant, is_all, is_constant, node, width_of
 from .stage_warnings import StageWarnings
 from .surface_models import NEUTRAL, conductor, has_white_edges, number, with_shape
 from .textures import Textures
 
-# USD's colour of meshes without one.
-GREY = [0.5, 0.5, 0.5]
-# Width of the lobe of `principled` where clearcoat_gloss is 0, and where it is 1.
-_DULL, _GLOSSY = 0.1, 0.001
-# Above it, nearly all light is reflected.
-_MOST_ETA = 1000.0
-# Reflectance of the coat of `principled` at normal incidence.
-_COAT = 0.04
-# Lobes as narrow as this are mirrors: float32 has no more, and `principled` has no narrower ones.
-_MIRROR = 0.001
-# With an index of 1, `principled` leaves out metal as well.
-_LEAST_ETA = 1.001
-# Numbers beyond 0 to 1 break Mitsuba's BSDFs.
+GREY = [0.5, 0.5, 0.5]  # Default displayColor of USD's viewers
+_DULL, _GLOSSY = 0.1, 0.001  # Width of the lobe of `principled` where clearcoat_gloss is 0, and where it is 1
+_MOST_ETA = 1000.0  # Largest index of refraction; nearly all light is reflected
+_COAT = 0.04  # Reflectance of the coat of `principled` at normal incidence
+_MIRROR = 0.001  # Width of the narrowest lobe of `principled`, at the limit of float32; narrower lobes are mirrors
+_LEAST_ETA = 1.001  # With an index of 1, `principled` loses its metal
+# Inputs that Mitsuba's BSDFs need between 0 and 1; plain images and primvars are kept.
 _FRACTIONS = ("roughness", "metalness", "transmission", "opacity")
-# Parameters of Mitsuba's own BSDFs that are no colours.
-_RAW = ("normalmap", "bumpmap")
-# Vertices of paths through glass: in and out of a shell twice, with reflections between.
-_DEEPEST = 24
-# Where roulette may end a path. At Mitsuba's own depth of 5, pictures of the same noise take up to 8 % longer: chess
-# set, shader ball and McUsd of usd-wg/assets.
+_RAW = ("normalmap", "bumpmap")  # Textures of Mitsuba's BSDFs that are no colours
+_DEEPEST = 24  # Vertices of paths through glass: in and out of a shell twice, with reflections between
+# Depth of Russian roulette, which ends few long paths through glass that matter: pictures of the same noise take up to
+# 8 % less time than at Mitsuba's default of 5 (chess set, shader ball and McUsd of usd-wg/assets).
 _ROULETTE = 3
 
 
 def bsdf(shape: ShapeContents, textures: Textures, notes: StageWarnings) -> SceneNode:
-    """BSDF of a shape's material, which may read its attributes; without one, its display colour and opacity."""
+    """BSDF of a shape's material, or of its displayColor and displayOpacity."""
     return _Surface(shape, textures, notes).bsdf()
 
 
@@ -51,11 +43,10 @@ def heights(shape: ShapeContents, textures: Textures, notes: StageWarnings) -> t
 
 
 def radiance(material: MaterialContents, textures: Textures, notes: StageWarnings) -> SceneNode | None:
-    """What a surface emits, as a texture or a spectrum; None if it is black."""
+    """Radiance of an emissive material, as a texture or a colour; None for others."""
     emission = material.inputs.get("emission", 0.0)
     if isinstance(emission, PrimvarContents):
         notes.add("emissiveColor from a primvar is ignored", material.name)
-        return None
     if not material.is_emissive:
         return None
     if isinstance(emission, (TextureContents, NodeContents)):
@@ -64,56 +55,43 @@ def radiance(material: MaterialContents, textures: Textures, notes: StageWarning
 
 
 def interior(material: MaterialContents | None) -> SceneNode:
-    """Property ``interior`` of a shape: the medium that a body is filled with, if it absorbs."""
-    if material is None or not absorbs(material):
+    """Property ``interior`` of a shape: the medium of an absorbing material."""
+    inputs = {} if material is None else material.inputs
+    depth, depth_color = inputs.get("depth", 0.0), inputs.get("depth_color")
+    is_clear_body = inputs.get("transmission", 0.0) != 0 and inputs.get("thin", 0.0) == 0
+    is_deep = isinstance(depth, (int, float)) and depth > 0
+    if not (is_clear_body and is_deep) or depth_color is None or not is_constant(depth_color):
         return {}
-    # After a path of the depth, light has its colour (Beer and Lambert).
-    color = np.clip(constant(material.inputs["depth_color"], 3), 1e-4, 1)
-    extinction = -np.log(color) / _first(material.inputs["depth"])
-    # Mitsuba takes colours up to 1, and a factor.
-    most = max(float(extinction.max()), 1e-6)
+    # Transmittance along the depth (Beer and Lambert).
+    extinction = -np.log(np.clip(constant(depth_color, 3), 1e-4, 1)) / _first(depth)
+    most = max(float(extinction.max()), 1e-6)  # Mitsuba's colours end at 1
     return {"interior": {"type": "homogeneous", "albedo": 0.0, "sigma_t": rgb(extinction / most), "scale": most}}
 
 
-def absorbs(material: MaterialContents) -> bool:
-    """Whether light fades on its way through a body of a material."""
-    inputs = material.inputs
-    depth, thin = inputs.get("depth", 0.0), inputs.get("thin", 0.0)
-    is_deep = isinstance(depth, (int, float)) and depth > 0 and thin == 0 and "depth_color" in inputs
-    return is_deep and inputs.get("transmission", 0.0) != 0 and is_constant(inputs["depth_color"])
-
-
-def integrator(
-    materials: list[MaterialContents],
-    usual: SceneNode,  # The integrator of scenes without glass
-    *,
-    has_clear_lamps: bool = False,  # Whether lights shine through the shapes of other lights
-) -> SceneNode:
-    """An integrator with as long paths as glass needs, and that knows media and clear surfaces if there are any.
-
-    Roulette ends paths through glass earlier than by default, as most of the long ones carry little.
-    """
-    kind = "volpath" if has_clear_lamps or any(map(absorbs, materials)) else usual["type"]
-    # Mitsuba's own BSDFs may be glass.
+def integrator(materials: list[MaterialContents], usual: SceneNode, *, has_clear_lamps: bool = False) -> SceneNode:
+    """The usual integrator, with paths that are long enough for glass, and with media and clear lamps if needed."""
+    kind = "volpath" if has_clear_lamps or any(map(interior, materials)) else usual["type"]
+    # BSDFs of Mitsuba may be glass.
     if all(material.inputs.get("transmission", 0.0) == 0 and "bsdf" not in material.inputs for material in materials):
         return {**usual, "type": kind}
     return {**usual, "type": kind, "max_depth": max(usual["max_depth"], _DEEPEST), "rr_depth": _ROULETTE}
 
 
 class _Surface:
-    """Assembles the BSDF of a shape; inputs of its material as Mitsuba's textures and numbers."""
-
     def __init__(self, shape: ShapeContents, textures: Textures, notes: StageWarnings) -> None:
         self._material, self._shape, self._textures, self._notes = shape.material, shape, textures, notes
-        # Plugins of Mitsuba, and parameters that they do not have.
-        self._lacking: set[tuple[str, str]] = set()
+        self._lacking: set[tuple[str, str]] = set()  # Plugins of Mitsuba with their unknown parameters
         inputs = {} if shape.material is None else shape.material.inputs
         given = {name: self._for_shape(value) for name, value in inputs.items() if name != "bsdf"}
         self._inputs: dict[str, Input] = {**NEUTRAL, **given}
-        self._inputs |= {name: _clamped(self._inputs[name]) for name in _FRACTIONS}
+        for name in _FRACTIONS:
+            value = self._inputs[name]
+            is_plain = isinstance(value, TextureContents) and value.scale == [1.0] * 4 and value.bias == [0.0] * 4
+            if not is_plain and not isinstance(value, PrimvarContents):
+                self._inputs[name] = node("clamp", "float", in_=value, low=0.0, high=1.0)
 
     def _for_shape(self, given: Input) -> Input:
-        """An input in which constant primvars of the shape are numbers; as a whole, it may be a varying primvar."""
+        """An input with the shape's constant primvars as numbers."""
         names = {leaf.name for leaf in leaves(given) if isinstance(leaf, PrimvarContents)}
         if not names:
             return given
@@ -136,8 +114,7 @@ class _Surface:
         return rgb(np.clip(value, 0, 1))
 
     def _plugin(self, given: Input, name: str = "") -> Any:
-        """A parameter of a plugin of Mitsuba, or a plugin of its own."""
-        if isinstance(given, NodeContents) and given.is_plugin:
+        if isinstance(given, NodeContents) and given.type == PLUGIN:
             kept = {k: v for k, v in given.inputs.items() if k and (given.category, k) not in self._lacking}
             return {"type": given.category, **{key: self._plugin(value, key) for key, value in kept.items()}}
         if isinstance(given, list):
@@ -150,7 +127,7 @@ class _Surface:
         return given
 
     def _loadable(self, given: Input, kind: type) -> SceneNode | None:
-        """Mitsuba's own plugin of a kind, without parameters that it lacks; None if Mitsuba cannot load it."""
+        """A plugin of a kind, without unknown parameters; None if Mitsuba cannot load it."""
         entry = self._plugin(given)
         try:
             if isinstance(mi.load_dict(entry), kind):
@@ -160,14 +137,14 @@ class _Surface:
             problem = str(error)
         plugin, unknown = re.search(r'plugin of type "(\w+)"', problem), re.findall(r'\n  - \w+ "(.+?)":', problem)
         if plugin and unknown:
-            self._leave(f"parameters that Mitsuba's {plugin[1]} does not have are ignored ({', '.join(unknown)})")
+            self._note(f"parameters that Mitsuba's {plugin[1]} does not have are ignored ({', '.join(unknown)})")
             self._lacking |= {(plugin[1], name) for name in unknown}
             return self._loadable(given, kind)
-        self._leave(f"nodes that Mitsuba cannot load are ignored ({problem.rpartition('] ')[2].splitlines()[0]})")
+        self._note(f"nodes that Mitsuba cannot load are ignored ({problem.rpartition('] ')[2].splitlines()[0]})")
         return None
 
     def number(self, given: Input) -> SceneNode | float:
-        if isinstance(given, NodeContents) and given.is_plugin:
+        if isinstance(given, NodeContents) and given.type == PLUGIN:
             return self._loadable(given, mi.Texture) or 0.0
         value = self._for_shape(given)
         if isinstance(value, PrimvarContents):
@@ -175,7 +152,6 @@ class _Surface:
         return self._textures.number(value) if isinstance(value, (TextureContents, NodeContents)) else _first(value)
 
     def _mean(self, name: str) -> NDArray[np.float64]:
-        """An input as a number or a colour, or the mean of a picture."""
         value = self._for_shape(self._inputs[name])
         if isinstance(value, (TextureContents, NodeContents)):
             return self._textures.mean(value)
@@ -184,11 +160,11 @@ class _Surface:
     def _is(self, name: str, value: float) -> bool:
         return is_all(self._inputs[name], value)
 
-    def _leave(self, what: str) -> None:
+    def _note(self, what: str) -> None:
         self._notes.add(what, self._shape.name if self._material is None else self._material.name)
 
     def bsdf(self) -> SceneNode:
-        """The BSDF, with its normal map and its holes."""
+        """The BSDF with its normal map and opacity."""
         if self._material is None:
             color = self._color(PrimvarContents("displayColor", GREY))
             opacity = self.number(PrimvarContents("displayOpacity", [1.0]))
@@ -203,36 +179,33 @@ class _Surface:
         if is_constant(weight) and _first(weight) <= 0:
             entry = self._opaque()
         elif is_constant(weight) and _first(weight) >= 1:
-            entry = self._turned(self._glass(), is_diffuse=False)
+            entry = self._with_normal_map(self._glass(), is_diffuse=False)
         else:
-            parts = {"bsdf_0": self._opaque(), "bsdf_1": self._turned(self._glass(), is_diffuse=False)}
+            parts = {"bsdf_0": self._opaque(), "bsdf_1": self._with_normal_map(self._glass(), is_diffuse=False)}
             entry = {"type": "blendbsdf", "weight": self.number(weight), **parts}
         return _masked(entry, self.number(self._inputs["opacity"]))
 
-    def _turned(self, bsdf: SceneNode, *, is_diffuse: bool = True) -> SceneNode:
-        """A BSDF with the normal map, if there is one.
-
-        Normals that face away from the viewer are flipped, which leaves no black patches. Cycles has the shadowing
-        function for diffuse lobes only.
-        """
+    def _with_normal_map(self, bsdf: SceneNode, *, is_diffuse: bool = True) -> SceneNode:
+        """A BSDF with the normal map, if there is one."""
         normal = self._for_shape(self._inputs.get("normal", 0.0))
         normals = self._textures.normals(normal) if isinstance(normal, (TextureContents, NodeContents)) else None
         if normals is None:
             return bsdf
+        # Normals that face away from the viewer would be black. The shadowing function is, as in Cycles, for diffuse
+        # lobes only.
         shading = {"use_shadowing_function": is_diffuse, "flip_invalid_normals": True}
         return {"type": "normalmap", "normalmap": normals, **shading, "bsdf": bsdf}
 
     def _opaque(self) -> SceneNode:
         if not self._is("translucency", 0):
-            # The same from both sides.
-            return self._turned(self._sheet(0.0))
+            return self._with_normal_map(self._sheet(0.0))
         is_bare = self._is("coat", 0) and self._is("sheen", 0)
         if is_bare and self._is("metalness", 1) and is_constant(self._inputs["base_color"]):
-            return _both_sides(self._turned(self._metal(), is_diffuse=False))
+            return _both_sides(self._with_normal_map(self._metal(), is_diffuse=False))
         if is_bare and self._is("metalness", 0) and (self._is("specular", 0) or self._is("specular_color", 0)):
             diffuse = {"type": "diffuse", "reflectance": self._color(self._inputs["base_color"])}
-            return _both_sides(self._turned(diffuse))
-        return _both_sides(self._turned(self._principled()))
+            return _both_sides(self._with_normal_map(diffuse))
+        return _both_sides(self._with_normal_map(self._principled()))
 
     def _principled(self) -> SceneNode:
         inputs = self._inputs
@@ -244,11 +217,10 @@ class _Surface:
             "metallic": self.number(inputs["metalness"]),
         }
         if not (self._is("metalness", 0) or has_white_edges(inputs["base_color"], inputs["edge_color"])):
-            self._leave("edge colours of metals with textures, coats or other layers are ignored; the edges are white")
+            self._note("edge colours of metals with textures, coats or other layers are ignored; the edges are white")
         ratio = self._ratio()
         if ratio is not None:
-            # The ratio of its widths is 1 - 0.9 anisotropic.
-            rest = node("invert", "float", in_=ratio, amount=1.0)
+            rest = node("invert", "float", in_=ratio, amount=1.0)  # The ratio of widths is 1 - 0.9 anisotropic
             entry["anisotropic"] = self.number(number("divide", rest, 0.9))
         if not self._is("coat", 0):
             factor = self._reflectance("coat_ior") / _COAT
@@ -259,14 +231,14 @@ class _Surface:
             brightness = float(color @ LUMINANCE)
             entry["sheen"] = self.number(number("multiply", inputs["sheen"], brightness))
             if np.ptp(color) > 0:
-                self._leave("colours of sheen only set its brightness; it is white")
+                self._note("colours of sheen only set its brightness; it is white")
         return entry
 
     def _gloss(self) -> SceneNode | float:
         """``clearcoat_gloss`` of a roughness, whose square is the width of the lobe."""
         roughness = self._inputs["coat_roughness"]
         if np.any(np.square(self._mean("coat_roughness")) > _DULL):
-            self._leave(f"coats rougher than {_DULL**0.5:.2f} are rendered with that roughness")
+            self._note(f"coats rougher than {_DULL**0.5:.2f} are rendered with that roughness")
         width = number("multiply", roughness, roughness)
         gloss = node("divide", "float", in1=node("invert", "float", in_=width, amount=_DULL), in2=_DULL - _GLOSSY)
         return self.number(node("clamp", "float", in_=gloss, low=0.0, high=1.0))
@@ -294,7 +266,6 @@ class _Surface:
         return {"type": "roughdielectric", "distribution": "ggx", **entry, **widths}
 
     def _sheet(self, transmission: float) -> SceneNode:
-        """A thin-walled BSDF."""
         inputs = self._inputs
         if transmission == 1 and self._widths() is None:
             color = self._color(inputs["transmission_color"])
@@ -312,19 +283,18 @@ class _Surface:
         return entry
 
     def _reflectance(self, name: str) -> float:
-        """Reflectance of an index of refraction at normal incidence."""
         eta = max(_first(self._mean(name)), 0.0)
         if not is_constant(self._inputs[name]):
-            self._leave("textures of indices of refraction are replaced by their means")
+            self._note("textures of indices of refraction are replaced by their means")
         return ((eta - 1) / (eta + 1)) ** 2
 
     def _eta(self) -> float:
-        """Index of refraction of the specular layer, from outside; its colour counts by its brightness."""
+        """Index of refraction with the reflectance of the specular layer; colours count by their luminance."""
         color = np.broadcast_to(self._mean("specular_color"), (3,))
         if np.ptp(color) > 0 and not self._is("metalness", 1):
-            self._leave("specularColor and specular_color only set the brightness of reflections, which are white")
+            self._note("specularColor and specular_color only set the brightness of reflections, which are white")
         if not (is_constant(self._inputs["specular"]) and is_constant(self._inputs["specular_color"])):
-            self._leave("textures of specular weights and colours are replaced by their means")
+            self._note("textures of specular weights and colours are replaced by their means")
         factor = _first(self._mean("specular")) * float(color @ LUMINANCE)
         root = np.sqrt(np.clip(self._reflectance("ior") * factor, 0, 0.998))
         return float((1 + root) / (1 - root))
@@ -337,7 +307,7 @@ class _Surface:
         ratio = number("max", ratio, 0.02)
         quarters = _first(self._mean("rotation")) * 4
         if abs(quarters - round(quarters)) > 0.01 or not is_constant(self._inputs["rotation"]):
-            self._leave("rotations of anisotropy are rounded to quarter turns")
+            self._note("rotations of anisotropy are rounded to quarter turns")
         return number("divide", 1.0, ratio) if round(quarters) % 2 else ratio
 
     def _widths(self) -> SceneNode | None:
@@ -353,14 +323,6 @@ class _Surface:
         root = number("power", ratio, 0.5)
         u, v = (number("min", number(category, width, root), 1.0) for category in ("divide", "multiply"))
         return {"alpha_u": self.number(u), "alpha_v": self.number(v)}
-
-
-def _clamped(given: Input) -> Input:
-    """A number from 0 to 1; plain pictures and attributes stay what they are."""
-    is_plain = isinstance(given, TextureContents) and given.scale == [1.0] * 4 and given.bias == [0.0] * 4
-    if is_plain or isinstance(given, PrimvarContents):
-        return given
-    return node("clamp", "float", in_=given, low=0.0, high=1.0)
 
 
 def _attribute(given: PrimvarContents) -> SceneNode:

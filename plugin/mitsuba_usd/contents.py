@@ -19,61 +19,56 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class NodeContents:
-    """A node of a shading network: what MaterialX computes of its inputs, or a plugin of Mitsuba."""
+    """A node of a shading network: a node of MaterialX, or a plugin of Mitsuba."""
 
     category: str  # Such as "multiply", see `materialx_nodes.OPERATIONS`; or the name of a plugin
-    type: str  # Of its output: "float", "color3", "vector2" and so on; "mitsuba" for plugins
-    # All its inputs except geometric ones. A string is an option. The category "texcoord" has the name of a primvar,
-    # and the fallback where a mesh lacks it; without a fallback, others of the mesh serve as well.
+    type: str  # Type of the output: "float", "color3", "vector2" and so on; `materialx_nodes.PLUGIN`
+    # All inputs except geometric ones; options are strings. "texcoord" has the name of a primvar, and a fallback for
+    # meshes without it; if there is no fallback, other texture coordinates of the mesh serve as well.
     inputs: dict[str, Input]
-
-    @property
-    def is_plugin(self) -> bool:
-        """Whether it is a plugin of Mitsuba."""
-        return self.type == "mitsuba"
 
 
 @dataclass(frozen=True, eq=False)
 class TextureContents:
-    """An image that an input of a material reads, ``scale * image + bias``."""
+    """An image with a scale and a bias, ``scale * image + bias``."""
 
     file: str  # Path; `a.usdz[b.png]` for a file in an archive
-    channel: str  # "rgb", "r", "g", "b" or "a"; within a `NodeContents` also "rg" and "rgba"
+    channel: str  # "rgb", "r", "g", "b" or "a"; as input of a node also "rg" and "rgba"
     color_space: str  # "auto", "raw" or "sRGB"
     wrap: str = "repeat"  # Mitsuba's name: "repeat", "clamp" or "mirror"
     scale: list[float] = field(default_factory=lambda: [1.0] * 4)
     bias: list[float] = field(default_factory=lambda: [0.0] * 4)
-    # (3, 3) float64: from texture coordinates to those of the picture, whose v points up
+    # (3, 3) float64: from texture coordinates to those of the image, whose v points up
     to_uv: NDArray = field(default_factory=lambda: np.eye(3))
     texcoords: NodeContents = field(default_factory=lambda: NodeContents("texcoord", "vector2", {"name": "st"}))
-    fallback: list[float] = field(default_factory=lambda: [0.0] * 4)  # Where there is no such file
+    fallback: list[float] = field(default_factory=lambda: [0.0] * 4)  # Value if the file is missing
 
     @property
     def channels(self) -> list[int]:
-        """Indices of the channel's letters among "rgba"."""
+        """Indices of the channels among "rgba"."""
         return ["rgba".index(letter) for letter in self.channel]
 
 
 @dataclass(frozen=True, eq=False)
 class PrimvarContents:
-    """An attribute of the mesh that an input of a material reads."""
+    """A primvar of the mesh; its fallback where the mesh lacks it."""
 
     name: str
     fallback: list[float]
 
 
 class MaterialError(ValueError):
-    """A material that cannot be read, with the reason."""
+    """Reason why a material cannot be read."""
 
 
 Part = TypeVar("Part", "ShapeContents", "LightContents")
 Source = TextureContents | PrimvarContents | NodeContents
-# A number or a colour, or where it comes from.
+# A number, a colour, an option, or the source of a value that varies.
 Input = float | list[float] | str | Source
 
 
 def parts(given: Input) -> list[Source]:
-    """An input itself, unless it is constant, and all that it depends on, each once."""
+    """Sources of an input, each once: itself, unless it is constant, and the inputs of its nodes, recursively."""
     known: dict[int, Source] = {}
     rest = [given]
     while rest:
@@ -85,36 +80,36 @@ def parts(given: Input) -> list[Source]:
 
 
 def leaves(given: Input) -> list[Source]:
-    """Pictures, attributes and texture coordinates that an input depends on."""
+    """Images, primvars and texture coordinates that an input depends on."""
     return [part for part in parts(given) if not isinstance(part, NodeContents) or part.category == "texcoord"]
 
 
 @dataclass(frozen=True, eq=False)
 class MaterialContents:
-    """A material, in the terms that all models of surfaces share, or as a BSDF of Mitsuba."""
+    """A material: inputs of `surface_models.NEUTRAL` that differ from their defaults, or a BSDF of Mitsuba."""
 
     name: str  # Path of the prim
-    # By names of `surface_models.NEUTRAL`, without defaults, or "bsdf"; and "displacement" and its scale, in its units
+    # Also "bsdf", and "displacement" and "displacement_scale" in units of the shape
     inputs: dict[str, Input]
 
     @property
     def is_emissive(self) -> bool:
-        """Whether it may shine."""
+        """Whether the emission is an image, an expression or above 0."""
         emission = self.inputs.get("emission", 0.0)
         if isinstance(emission, (TextureContents, NodeContents)):
             return True
         return not isinstance(emission, (PrimvarContents, str)) and np.any(np.greater(emission, 0)).item()
 
     def textures(self) -> list[TextureContents]:
-        """Pictures that it reads."""
+        """Images of all inputs."""
         return [leaf for leaf in self._leaves() if isinstance(leaf, TextureContents)]
 
     def primvars(self) -> set[str]:
-        """Names of the attributes that it reads."""
+        """Names of the primvars of all inputs."""
         return {leaf.name for leaf in self._leaves() if isinstance(leaf, PrimvarContents)}
 
     def texcoords(self) -> dict[str, Input | None]:
-        """Names of the texture coordinates that it reads, with their fallbacks."""
+        """Names of the texture coordinates of all inputs, with their fallbacks."""
         sets = (leaf.texcoords if isinstance(leaf, TextureContents) else leaf for leaf in self._leaves())
         return {str(s.inputs["name"]): s.inputs.get("fallback") for s in sets if isinstance(s, NodeContents)}
 
@@ -124,21 +119,21 @@ class MaterialContents:
 
 @dataclass(frozen=True, eq=False)
 class ShapeContents:
-    """A mesh, those faces of a mesh that have one material, or curves."""
+    """A mesh, the faces of a mesh with one material, or curves."""
 
     name: str  # Path of the prim
-    cage: CageContents  # In the prim's own space. Without a scheme, it is a polygon mesh.
-    to_world: NDArray  # (4, 4) float64: to the world, or to the space of the group that the shape belongs to
-    normals: NDArray | None = None  # (n_h, 3) float64: of a polygon mesh, at its face corners; None for facets
-    material: MaterialContents | None = None  # Those that are equal are one
-    constants: dict[str, list[float]] = field(default_factory=dict)  # Attributes with one value for the whole mesh
-    radiance: list[float] | None = None  # Three numbers, if the mesh is a light
-    is_normalized: bool = False  # Whether the radiance is that of the whole light, to be divided by its area
+    cage: CageContents  # In the prim's own space; a polygon mesh if it has no scheme
+    to_world: NDArray  # (4, 4) float64: to the world, or to the space of a group
+    normals: NDArray | None = None  # (n_h, 3) float64: at face corners of a polygon mesh; None for facets
+    material: MaterialContents | None = None  # The same object for equal materials
+    constants: dict[str, list[float]] = field(default_factory=dict)  # Primvars with one value for the whole mesh
+    radiance: list[float] | None = None  # RGB of a mesh light
+    is_normalized: bool = False  # Whether the radiance is to be divided by the area of the mesh
     # (n,) int: faces with this material, of a limit surface that is evaluated whole; None for all. Parts of polygon
     # meshes and of large surfaces have the other faces as holes.
     shown_faces: NDArray | None = None
-    curves: CurveSet | None = None  # In the prim's own space; then the cage has their points in USD, and no faces
-    rate: int | None = None  # Segments on each edge, where the stage says
+    curves: CurveSet | None = None  # In the prim's own space; the cage then has their points in USD, and no faces
+    rate: int | None = None  # Segments on each edge that the stage states
 
     @property
     def is_displaced(self) -> bool:
@@ -148,30 +143,29 @@ class ShapeContents:
 
 @dataclass(frozen=True, eq=False)
 class InstanceContents:
-    """A group of shapes, placed in the world."""
+    """A group of shapes with a place in the world."""
 
     name: str
     group: int
     to_world: NDArray
 
     def placed(self, part: Part) -> Part:
-        """A part of the group where the instance is."""
+        """A shape or light of the group, in the place of the instance."""
         return replace(part, name=f"{self.name}{part.name}", to_world=self.to_world @ part.to_world)
 
 
 @dataclass(frozen=True, eq=False)
 class LightContents:
-    """A light."""
+    """A light of UsdLux."""
 
     name: str  # Path of the prim
     kind: str  # "distant", "rect", "disk", "sphere", "point", "spot", "cylinder" or "dome"
     to_world: NDArray  # (4, 4) float64
-    emission: list[float]  # Three numbers: colour times intensity
-    is_normalized: bool = False  # Whether the emission is that of the whole light: its area does not change its power
-    # Angle in degrees, width and height, radius, or length and radius. Of a spot, its radius, and the angle and the
-    # softness of its cone.
+    emission: list[float]  # RGB: colour times intensity
+    is_normalized: bool = False  # Whether the area of the light does not change its power
+    # Angle in degrees; width and height; radius; length and radius; or radius, cone angle and softness of a spot
     size: list[float] = field(default_factory=list)
-    texture: str | None = None  # Path of a picture that multiplies the radiance
+    texture: str | None = None  # Path of an image that multiplies the radiance
     pole: str = "y"  # Axis of a dome's image
 
 
@@ -182,42 +176,40 @@ class CameraContents:
     name: str  # Path of the prim
     to_world: NDArray  # (4, 4) float64
     is_perspective: bool
-    # Two numbers each: of the film, horizontal and vertical, in the same unit as the focal length; for orthographic
-    # cameras, in the world's
+    # Horizontal and vertical, in the unit of the focal length; of orthographic cameras, in the world's unit
     aperture: list[float]
     offset: list[float]
     focal_length: float
     near: float
     far: float
-    # In the world's units; 0 without depth of field
+    # In the world's unit; 0 without depth of field
     lens_radius: float
     focus_distance: float
-    shutter: list[float]  # When it opens and closes, in time codes after the time
-    conform_policy: str = "expandAperture"  # For pictures of another aspect ratio; see `sensors.film_window`
-    mitsuba: dict[str, Any] = field(default_factory=dict)  # Parameters of Mitsuba's sensor that the prim states
+    shutter: list[float]  # Time codes of its opening and closing, relative to the frame
+    conform_policy: str = "expandAperture"  # Value of aspectRatioConformPolicy
+    mitsuba: dict[str, Any] = field(default_factory=dict)  # Authored parameters of Mitsuba's sensor
 
 
-# Of a picture, whose y points up.
-WHOLE = [0.0, 0.0, 1.0, 1.0]
+WHOLE = [0.0, 0.0, 1.0, 1.0]  # Least and largest x and y of a picture, whose y points up
 
 
 @dataclass(frozen=True, eq=False)
 class PictureContents:
-    """Render settings of a stage, with those of its first render product."""
+    """Render settings of a stage, and of its first render product."""
 
     name: str = ""  # Path of the prim
-    resolution: list[int] | None = None
-    window: list[float] = field(default_factory=lambda: WHOLE)  # Least x and y, then largest, of what is rendered
+    resolution: tuple[int, int] | None = None
+    window: list[float] = field(default_factory=lambda: WHOLE)  # Rendered part of the picture
     is_transparent: bool = False  # Whether pictures have alpha
     spp: int | None = None  # Samples per pixel
-    integrator: dict[str, Any] = field(default_factory=dict)  # Parameters of Mitsuba's integrator
-    aovs: dict[str, str] = field(default_factory=dict)  # Types of Mitsuba's AOVs, by the names of their variables
-    products: dict[str, list[str]] = field(default_factory=dict)  # Names of AOVs of products; "" is the colour
+    integrator: dict[str, Any] = field(default_factory=dict)  # Authored parameters of Mitsuba's integrator
+    aovs: dict[str, str] = field(default_factory=dict)  # Types of Mitsuba's AOVs by the names of render variables
+    products: dict[str, list[str]] = field(default_factory=dict)  # AOVs of each product; "" is the colour
 
 
 @dataclass(frozen=True, eq=False)
 class SceneContents:
-    """Contents of a stage, or of a part of it; a part has names relative to it, and groups of the whole stage."""
+    """Contents of a stage, or of a subtree: with names relative to it, and groups of the whole stage."""
 
     up: str = "y"
     shapes: list[ShapeContents] = field(default_factory=list)
@@ -238,19 +230,22 @@ class SceneContents:
         return list(dict.fromkeys(shape.material for shape in self.all_shapes if shape.material is not None))
 
     @property
-    def placed_shapes(self) -> list[tuple[ShapeContents, NDArray[np.float64]]]:
-        """Shapes and their matrices to the world, those of a group once for each of its instances."""
-        placed = [(shape, shape.to_world) for shape in self.shapes]
+    def placements(self) -> dict[ShapeContents, NDArray[np.float64]]:
+        """Transforms ``(n, 4, 4)`` to the world of each shape; of a shape in a group, one for each instance."""
+        found: dict[ShapeContents, list[NDArray[np.float64]]] = {}
+        for shape in self.shapes:
+            found.setdefault(shape, []).append(shape.to_world)
         for instance in self.instances:
-            placed += [(shape, instance.to_world @ shape.to_world) for shape in self.groups[instance.group]]
-        return placed
+            for shape in self.groups[instance.group]:
+                found.setdefault(shape, []).append(instance.to_world @ shape.to_world)
+        return {shape: np.stack(matrices) for shape, matrices in found.items()}
 
     @property
     def is_lit(self) -> bool:
-        """Whether there are lights; emissive materials do not count."""
+        """Whether there are lights of UsdLux."""
         return bool(self.lights) or any(shape.radiance and any(shape.radiance) for shape in self.all_shapes)
 
     @property
     def has_surfaces(self) -> bool:
-        """Whether there are meshes to be subdivided."""
+        """Whether there are limit surfaces."""
         return any(shape.cage.scheme is not None for shape in self.all_shapes)

@@ -17,26 +17,26 @@ from numpy.typing import NDArray
 from .contents import SceneContents, ShapeContents
 from .stage_warnings import StageWarnings
 
-# Fewer instances cost less than a second in each picture.
-LEAST_INSTANCES = 64
-# Faces from which on copies load sooner as shapes of their own than as one mesh, in a third of the memory.
+LEAST_INSTANCES = 64  # Fewer instances cost less than a second in each picture
+# Faces of meshes whose copies load sooner as shapes of their own than as one mesh, in a third of the memory.
 LARGE = 10_000
-# Of copies as one mesh, measured; and what they may take of the memory of the machine, and at most.
+# Measured memory of copies as one mesh; and its largest part of the machine's memory, and largest size.
 FACE_BYTES, TRIANGLE_BYTES, POINT_BYTES = {"exact": 600, "vertex": 300}, 170, 400
 MOST_PART, MOST_BYTES = 0.75, 6e9
-# Of a picture of so many instances, whose time grows with the square of their number.
+# Time of a picture of instances, which grows with the square of their number.
 MEASURED_INSTANCES, MEASURED_SECONDS = 2_000, 65
+Rates = Mapping[ShapeContents, IntArray]  # Needed segments on each edge, (n,) for the placements of each shape
 
 
 def with_large_copies(contents: SceneContents) -> SceneContents:
-    """A scene where instances of large shapes are shapes of their own, if there are many instances."""
+    """Contents where instances of large or displaced shapes are shapes of their own, if there are many instances."""
     if len(contents.instances) < LEAST_INSTANCES:
         return contents
-    sizes = [[len(shape.cage.face_sizes) for shape in group] for group in contents.groups]
-    is_large = [bool(group) and sum(group) >= LARGE * len(group) for group in sizes]
     # Heights are in the space of each copy, and one mesh of all copies has one.
     is_large = [
-        a or any(shape.is_displaced for shape in group) for a, group in zip(is_large, contents.groups, strict=True)
+        any(shape.is_displaced for shape in group)
+        or (bool(group) and sum(len(shape.cage.face_sizes) for shape in group) >= LARGE * len(group))
+        for group in contents.groups
     ]
     copies = [
         instance.placed(shape)
@@ -56,29 +56,22 @@ def with_large_copies(contents: SceneContents) -> SceneContents:
 
 
 def with_copies(
-    contents: SceneContents,
-    rates: Mapping[ShapeContents, IntArray],  # (n,) int: segments that copies need, as `placed_shapes` has them
-    shading: str,
-    notes: StageWarnings,
-    *,
-    lowest: int = 1,
+    contents: SceneContents, rates: Rates, shading: str, notes: StageWarnings, lowest: int = 1
 ) -> tuple[SceneContents, dict[ShapeContents, int]]:
-    """A scene where many copies of a shape are one shape for each rate that they need; and the rates of such shapes.
+    """Contents where many copies of a shape are one shape for each rate that they need; and the rates of such shapes.
 
-    If all would take more than `MOST_BYTES`, the highest rate gives way, down to the lowest; or else instances stay.
+    If all would take more than `MOST_BYTES`, the highest rate is lowered down to the lowest; or else instances stay.
     """
     is_displaced = any(shape.is_displaced for group in contents.groups for shape in group)
     are_many = len(contents.instances) >= LEAST_INSTANCES and not is_displaced
-    of_group: dict[int, list[NDArray[np.float64]]] = {}
-    for instance in contents.instances if are_many else []:
-        of_group.setdefault(instance.group, []).append(instance.to_world)
-    # Name of all copies of a shape, their transforms (n, 4, 4) to the world, and the rates (n,) that they need.
+    placements = contents.placements if are_many else {}
+    # Name of the copies of each shape, their transforms (n, 4, 4) to the world, and the rates (n,) that they need.
     placed: dict[ShapeContents, tuple[str, NDArray[np.float64]]] = {}
     needed: dict[ShapeContents, IntArray] = {}
-    for number, matrices in sorted(of_group.items()):
-        for shape in contents.groups[number]:
-            placed[shape] = f"/copies_{number}{shape.name}", np.stack(matrices) @ shape.to_world
-            needed[shape] = rates.get(shape, np.ones(len(matrices), np.int64))
+    for number, group in enumerate(contents.groups):
+        for shape in filter(placements.__contains__, group):
+            placed[shape] = f"/copies_{number}{shape.name}", placements[shape]
+            needed[shape] = rates.get(shape, np.ones(len(placements[shape]), np.int64))
     of_cage: dict[tuple[int, int], list[ShapeContents]] = {}
     for shape in contents.shapes:
         if len(shape.cage.face_sizes) < LARGE and not shape.is_displaced:
@@ -119,8 +112,7 @@ def _allowed_bytes() -> float:
     return min(MOST_BYTES, MOST_PART * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
 
 
-def _bytes(rates: Mapping[ShapeContents, IntArray], most: int, shading: str) -> float:
-    """Memory of copies as one mesh, with rates up to the given one."""
+def _bytes(rates: Rates, most: int, shading: str) -> float:
     total = 0.0
     for shape, of_copies in rates.items():
         cage, is_smooth, count = shape.cage, shape.cage.scheme is not None, len(of_copies)
@@ -133,14 +125,13 @@ def _bytes(rates: Mapping[ShapeContents, IntArray], most: int, shading: str) -> 
 
 
 def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> ShapeContents:
-    """One shape of all copies of a shape, with the transforms ``(n, 4, 4)``."""
     cage, count = shape.cage, len(matrices)
     linear = matrices[:, :3, :3]
     positions = points_at(np.asarray(cage.positions, dtype=np.float64), matrices)
-    # Corners of the faces in each copy; faces of mirrored ones are turned over.
+    # Corners of the faces of each copy, in reversed order for mirrored copies.
     is_mirrored = np.linalg.det(linear) < 0
     corners = np.where(is_mirrored[:, None], reversed_order(cage.face_sizes), np.arange(len(cage.face_vertices)))
-    # Numbers of the first vertex and face of each copy.
+    # First vertex and face of each copy.
     vertex, face = (step * np.arange(count)[:, None] for step in (len(cage.positions), len(cage.face_sizes)))
     normals = shape.normals
     if normals is not None:

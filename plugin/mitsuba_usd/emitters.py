@@ -14,27 +14,23 @@ from .contents import LightContents
 from .stage_warnings import StageWarnings
 from .textures import Textures
 
-# From a dome whose pole is y, as Mitsuba's, to one whose pole is z: y becomes z, and z becomes -y.
+# From Mitsuba's environments, whose pole is y, to domes with the pole z.
 _POLE_TO_Z = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-# From a light that emits along z, as Mitsuba's, to one that emits along -z with the same y.
-_TURNED = np.diag([-1.0, 1, -1, 1])
-# Mitsuba divides by the width of the edge of a cone.
-_LEAST_SOFTNESS = 1e-3
+_TURNED = np.diag([-1.0, 1, -1, 1])  # From Mitsuba's lights, which emit along z, to USD's, which emit along -z
+_LEAST_SOFTNESS = 1e-3  # Least softness of a cone, as Mitsuba divides by it
 
 
 def emitter(light: LightContents, textures: Textures) -> SceneNode:
-    """An emitter, or a shape with one."""
-    if light.kind in _MAYBE_TEXTURED:
-        return _MAYBE_TEXTURED[light.kind](light, textures)
-    return _MAKERS[light.kind](light)
+    """An emitter, or a shape with an emitter."""
+    textured = _TEXTURED.get(light.kind)
+    return _UNTEXTURED[light.kind](light) if textured is None else textured(light, textures)
 
 
 def _distant(light: LightContents) -> SceneNode:
     angle = math.radians(min(light.size[0], 180.0))
     irradiance = np.array(light.emission)
     if angle > 0 and not light.is_normalized:
-        # Radiance times the solid angle, projected onto a plane that faces the light.
-        irradiance = irradiance * math.pi * math.sin(angle / 2) ** 2
+        irradiance = irradiance * math.pi * math.sin(angle / 2) ** 2  # Radiance times the projected solid angle
     direction = -light.to_world[:3, 2]
     direction /= np.linalg.norm(direction)
     return {"type": "directional", "direction": direction.tolist(), "irradiance": rgb(irradiance)}
@@ -46,7 +42,7 @@ def _flat(light: LightContents, textures: Textures) -> SceneNode:
     area = _area(light, (4 if is_rect else math.pi) * u * v * _stretch(light.to_world, 0, 1))
     bitmap = None if light.texture is None else textures.radiance(light.texture, area["radiance"]["value"])
     if bitmap is not None:
-        # The image is upright for a viewer that looks at the light.
+        # The image is upright as seen from the front of the light.
         upright = mi.ScalarAffineTransform3f([[1, 0, 0], [0, -1, 1], [0, 0, 1]])
         area["radiance"] = {"type": "bitmap", "bitmap": bitmap, "to_uv": upright, "wrap_mode": "clamp"}
     to_world = mi.ScalarTransform4f((light.to_world @ _TURNED @ np.diag([u, v, 1, 1])).tolist())
@@ -59,7 +55,7 @@ def _sphere(light: LightContents) -> SceneNode:
 
 
 def _point(light: LightContents) -> SceneNode:
-    # The intensity of a sphere from afar, which does not depend on its radius if it is normalised.
+    # Intensity of a sphere from afar; independent of the radius of a normalized one.
     intensity = np.array(light.emission) * (0.25 if light.is_normalized else math.pi * _world_radius(light) ** 2)
     return {"type": "point", "position": light.to_world[:3, 3].tolist(), "intensity": rgb(intensity)}
 
@@ -89,19 +85,17 @@ def _dome(light: LightContents, textures: Textures) -> SceneNode:
     bitmap = None if light.texture is None else textures.radiance(light.texture, radiance)
     if bitmap is None:
         return {"type": "constant", "radiance": rgb(radiance)}
-    turned = light.to_world.copy()
+    turned = light.to_world @ (_POLE_TO_Z if light.pole == "z" else np.eye(4))
     turned[:3, 3] = 0
-    if light.pole == "z":
-        turned = turned @ _POLE_TO_Z
     return {"type": "envmap", "bitmap": bitmap, "to_world": mi.ScalarTransform4f(turned.tolist())}
 
 
-_MAYBE_TEXTURED = {"rect": _flat, "disk": _flat, "dome": _dome}
-_MAKERS = {"distant": _distant, "sphere": _sphere, "point": _point, "spot": _spot, "cylinder": _cylinder}
+_TEXTURED = {"rect": _flat, "disk": _flat, "dome": _dome}
+_UNTEXTURED = {"distant": _distant, "sphere": _sphere, "point": _point, "spot": _spot, "cylinder": _cylinder}
 
 
 def one_environment(lights: list[LightContents], notes: StageWarnings) -> list[LightContents]:
-    """The lights, with one dome at most, as Mitsuba's scenes have one environment: the first with a picture."""
+    """The lights with at most one dome, the first with a texture, as Mitsuba's scenes have one environment."""
     domes = [light for light in lights if light.kind == "dome"]
     kept = next((light for light in domes if light.texture), domes[0] if domes else None)
     left = [light for light in domes if light is not kept]
@@ -111,9 +105,9 @@ def one_environment(lights: list[LightContents], notes: StageWarnings) -> list[L
 
 
 def are_lamps_in_the_way(lights: list[LightContents], points: NDArray[np.float64]) -> bool:
-    """Whether shapes of lights may come between points ``(n, 3)`` and other lights, by their bounding spheres.
+    """Whether bounding spheres of lights come between points ``(n, 3)`` and other lights.
 
-    A dome without a picture does not count: paths that a BSDF samples find it behind clear shapes.
+    A dome without a texture does not count: paths that a BSDF samples find it behind clear shapes.
     """
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = np.linalg.norm(points - middle, axis=1).max()
@@ -127,7 +121,7 @@ def are_lamps_in_the_way(lights: list[LightContents], points: NDArray[np.float64
             if other.kind == "distant":
                 towards = other.to_world[:3, 2] / np.linalg.norm(other.to_world[:3, 2])
                 start, start_radius = middle + towards * (radius + np.linalg.norm(place - middle)), radius
-            # The cone around the other light and the points, at the place along its axis that is next to the lamp.
+            # The cone around the other light and the points, at the nearest place of its axis to the lamp.
             axis = middle - start
             along = np.clip((place - start) @ axis / max(axis @ axis, 1e-30), 0, 1)
             cone_radius = start_radius + along * (radius - start_radius)

@@ -1,17 +1,15 @@
 """MaterialX documents as layers of USD.
 
-The USD library as it is on PyPI cannot open ``.mtlx`` files. Here a document becomes a layer as OpenUSD's own plugin
-``usdMtlx`` makes it: materials are ``/MaterialX/Materials/NAME``, with a shader named by its definition, the inputs of
-which are those of the material, and with the node graphs that it reads. Layers that lead to documents are copied, and
-the copies lead to these layers instead. So USD itself composes references, variants and instances, and no layer changes
-that somebody else may have open.
+The USD library of PyPI cannot open ``.mtlx`` files. Here a document becomes a layer as in OpenUSD's plugin ``usdMtlx``:
+``/MaterialX/Materials/NAME`` with a shader that is named by its definition and reads the inputs of the material, and
+with its node graphs. Layers that refer to documents are copied, and the copies refer to these layers instead. So USD
+composes references, variants and instances, and open layers do not change.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import posixpath
-from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,28 +28,19 @@ _TYPES = {
     "matrix33": "Matrix3d", "matrix44": "Matrix4d",
 }  # fmt: skip
 
-# Files that other renderers' shaders are in are left: only definitions and graphs are read.
+# Folders with definitions and graphs, without shaders of other renderers.
 _FOLDERS = ("stdlib", "pbrlib", "bxdf", "cmlib", "nprlib")
 
 
 def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
-    """The stage, or if it refers to MaterialX documents, one of copies of its layers that has them."""
+    """The stage, or a stage of copies of its layers if they refer to MaterialX documents."""
     if Sdf.FileFormat.FindByExtension(_EXTENSION[1:]) is not None or not has_materialx():
         return stage
     identifiers: dict[str, str] = {}
-    # Kept, as nothing else holds them before the stage is open.
-    layers: list[Sdf.Layer] = []
-
-    def document(path: str) -> str:
-        """Identifier of the layer of a document; that of the document if it cannot be read, so that USD says so."""
-        if path not in identifiers:
-            layer = _layer_of_document(path, name)
-            layers.extend([] if layer is None else [layer])
-            identifiers[path] = path if layer is None else layer.identifier
-        return identifiers[path]
+    layers: list[Sdf.Layer] = []  # Keeps the layers alive until the stage is open
 
     def copied(layer: Sdf.Layer) -> str:
-        """Identifier of a layer, or of its copy if it leads to documents."""
+        """Identifier of a layer, or of its copy if it refers to documents."""
         if layer.identifier in identifiers:
             return identifiers[layer.identifier]
         identifiers[layer.identifier] = layer.identifier
@@ -59,15 +48,20 @@ def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
         for path in layer.GetCompositionAssetDependencies():
             absolute = layer.ComputeAbsolutePath(path)
             if path.endswith((_EXTENSION, f"{_EXTENSION}]")):
-                replaced[path] = document(absolute)
+                if absolute not in identifiers:
+                    made = _layer_of_document(absolute, name)
+                    layers.extend([] if made is None else [made])
+                    # USD warns of an unreadable document.
+                    identifiers[absolute] = absolute if made is None else made.identifier
+                replaced[path] = identifiers[absolute]
             elif (below := Sdf.Layer.Find(absolute)) and copied(below) != below.identifier:
                 replaced[path] = copied(below)
         if not replaced:
             return layer.identifier
 
         def moved(path: str) -> str:
-            is_absolute = not path or path.startswith("`")
-            return replaced.get(path) or (path if is_absolute else layer.ComputeAbsolutePath(path))
+            is_kept = not path or path.startswith("`")
+            return replaced.get(path) or (path if is_kept else layer.ComputeAbsolutePath(path))
 
         copy = Sdf.Layer.CreateAnonymous(Path(layer.GetDisplayName()).stem + ".usda")
         copy.TransferContent(layer)
@@ -81,7 +75,7 @@ def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
 
 
 def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
-    """The layer of a document; None, with a note, if it cannot be read."""
+    """The layer of a document; None, with a warning, if it is unreadable."""
     import MaterialX
 
     resolved = Ar.GetResolver().Resolve(path)
@@ -98,9 +92,10 @@ def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
             text = bytes(asset.GetBuffer()).decode()
         search = MaterialX.FileSearchPath(str(Path(str(resolved)).parent))
         MaterialX.readFromXmlString(document, text, search)
+        document.setSourceUri(str(resolved))
         for node in document.getMaterialNodes():
-            _Material(stage, node, str(resolved))
-    # Nodes that are built of themselves cause the last one.
+            _add_material(stage, node)
+    # Nodes that are built of themselves raise the last error.
     except (MaterialX.ExceptionParseError, MaterialX.Exception, OSError, UnicodeError, RecursionError) as error:
         warn(f"{name}: the MaterialX document {path} cannot be read ({str(error).strip()}); its materials are ignored")
         return None
@@ -108,126 +103,121 @@ def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
 
 
 def _beside(path: str, document: str) -> str:
-    """Path of a file that a document refers to, maybe in an archive."""
-
-    def beside(file: str) -> str:
-        return posixpath.normpath(posixpath.join(posixpath.dirname(file), path))
-
-    if not Ar.IsPackageRelativePath(document):
-        absolute = str(Ar.GetResolver().CreateIdentifier(path, Ar.ResolvedPath(document)))
-        # What is not there, as the pattern of a picture's tiles, may come back as it is.
-        return absolute if absolute != path else beside(document)
-    package, inner = Ar.SplitPackageRelativePathInner(document)
-    return str(Ar.JoinPackageRelativePath([package, beside(inner)]))
+    """Path of a file relative to a document, which may be in an archive."""
+    is_packed = Ar.IsPackageRelativePath(document)
+    package, inner = Ar.SplitPackageRelativePathInner(document) if is_packed else ("", document)
+    beside = posixpath.normpath(posixpath.join(posixpath.dirname(inner), path))
+    if is_packed:
+        return str(Ar.JoinPackageRelativePath([package, beside]))
+    absolute = str(Ar.GetResolver().CreateIdentifier(path, Ar.ResolvedPath(document)))
+    # USD keeps paths of missing files, such as patterns of tiles.
+    return absolute if absolute != path else beside
 
 
-class _Material:
-    def __init__(self, stage: Usd.Stage, node: MaterialX.Node, document: str) -> None:
-        import MaterialX
+def _add_material(stage: Usd.Stage, node: MaterialX.Node) -> None:
+    """Add a material, with shaders that read its inputs."""
+    import MaterialX
 
-        self._stage, self._document = stage, document
-        self._path = stage.GetPrimAtPath("/MaterialX/Materials").GetPath().AppendChild(_prim_name(node.getName()))
-        self._source = node.getDocument()
-        material = UsdShade.Material.Define(stage, self._path)
-        for kind, output in _OUTPUTS.items():
-            for shader in MaterialX.getShaderNodes(node, kind):
-                definition = shader.getNodeDef("", True)
-                if definition is not None:
-                    source = self._add_shader(shader, definition.getName())
-                    material.CreateOutput(f"mtlx:{output}", _sdf_type("token")).GetAttr().AddConnection(source)
+    path = stage.GetPrimAtPath("/MaterialX/Materials").GetPath().AppendChild(_prim_name(node.getName()))
+    material = UsdShade.Material.Define(stage, path)
+    for kind, output in _OUTPUTS.items():
+        for shader in MaterialX.getShaderNodes(node, kind):
+            if (definition := shader.getNodeDef("", True)) is None:
+                continue
+            prim = UsdShade.Shader.Define(stage, path.AppendChild(definition.getName()))
+            prim.CreateIdAttr(definition.getName())
+            for port in shader.getInputs():
+                given = _add_input(material, material.ConnectableAPI(), port, path)
+                prim.CreateInput(given.GetBaseName(), given.GetTypeName()).ConnectToSource(given)
+            out = prim.CreateOutput("out", _sdf_type("token")).GetAttr().GetPath()
+            material.CreateOutput(f"mtlx:{output}", _sdf_type("token")).GetAttr().AddConnection(out)
 
-    def _add_shader(self, shader: MaterialX.Node, name: str) -> Sdf.Path:
-        """Add the shader of a material, whose inputs are those of the material, and return the path of its output."""
-        prim = UsdShade.Shader.Define(self._stage, self._path.AppendChild(name))
-        prim.CreateIdAttr(name)
-        out = prim.CreateOutput("out", _sdf_type("token"))
-        material = UsdShade.ConnectableAPI.Get(self._stage, self._path)
-        for port in shader.getInputs():
-            given = self._add_input(material, port, self._path, self._source)
-            prim.CreateInput(given.GetBaseName(), given.GetTypeName()).ConnectToSource(given)
-        return out.GetAttr().GetPath()
 
-    def _add_graph(
-        self, graph: Any, path: Sdf.Path, inputs: Iterable[MaterialX.Input], parent: Sdf.Path, container: Any
-    ) -> None:
-        connectable = UsdShade.NodeGraph.Define(self._stage, path).ConnectableAPI()
-        for port in inputs:
-            self._add_input(connectable, port, parent, container)
-        for node in graph.getNodes():
-            self._add_node(node, path, graph)
-        for output in graph.getOutputs():
-            port = connectable.CreateOutput(_prim_name(output.getName()), _sdf_type(output.getType()))
-            self._connect(port.GetAttr(), output, path, graph)
+def _add_graph(material: UsdShade.Material, graph: Any, path: Sdf.Path, inputs: list[Any], parent: Sdf.Path) -> None:
+    connectable = UsdShade.NodeGraph.Define(material.GetPrim().GetStage(), path).ConnectableAPI()
+    for port in inputs:
+        _add_input(material, connectable, port, parent)
+    for node in graph.getNodes():
+        _add_node(material, node, path)
+    for output in graph.getOutputs():
+        port = connectable.CreateOutput(_prim_name(output.getName()), _sdf_type(output.getType()))
+        _connect(material, port.GetAttr(), output, path)
 
-    def _add_node(self, node: MaterialX.Node, parent: Sdf.Path, container: Any) -> Sdf.Path:
-        """Add a node, and return its path. One that the document itself builds of others is a graph."""
-        import MaterialX
 
-        path = parent.AppendChild(_prim_name(node.getName()))
-        if self._stage.GetPrimAtPath(path):
-            return path
-        definition = node.getNodeDef("", True)
-        name = "" if definition is None else definition.getName()
-        implementation = None if definition is None else definition.getImplementation()
-        if isinstance(implementation, MaterialX.NodeGraph) and library().getNodeDef(name) is None:
-            given = {port.getName() for port in node.getInputs()}
-            others = [port for port in definition.getActiveInputs() if port.getName() not in given]
-            self._add_graph(implementation, path, (*others, *node.getInputs()), parent, container)
-            return path
-        shader = UsdShade.Shader.Define(self._stage, path)
-        shader.CreateIdAttr(name or node.getCategory())
-        for output in [] if definition is None else definition.getActiveOutputs():
-            shader.CreateOutput(output.getName(), _sdf_type(output.getType()))
-        for port in node.getInputs():
-            self._add_input(shader.ConnectableAPI(), port, parent, container)
+def _add_node(material: UsdShade.Material, node: MaterialX.Node, parent: Sdf.Path) -> Sdf.Path:
+    """Add a node, as a graph if the document defines it by one; return its path."""
+    import MaterialX
+
+    stage, path = material.GetPrim().GetStage(), parent.AppendChild(_prim_name(node.getName()))
+    if stage.GetPrimAtPath(path):
         return path
+    definition = node.getNodeDef("", True)
+    name = "" if definition is None else definition.getName()
+    implementation = None if definition is None else definition.getImplementation()
+    if isinstance(implementation, MaterialX.NodeGraph) and library().getNodeDef(name) is None:
+        given = {port.getName() for port in node.getInputs()}
+        others = [port for port in definition.getActiveInputs() if port.getName() not in given]
+        _add_graph(material, implementation, path, [*others, *node.getInputs()], parent)
+        return path
+    shader = UsdShade.Shader.Define(stage, path)
+    shader.CreateIdAttr(name or node.getCategory())
+    for output in [] if definition is None else definition.getActiveOutputs():
+        shader.CreateOutput(output.getName(), _sdf_type(output.getType()))
+    for port in node.getInputs():
+        _add_input(material, shader.ConnectableAPI(), port, parent)
+    return path
 
-    def _add_input(self, connectable: Any, given: MaterialX.Input, parent: Sdf.Path, container: Any) -> Any:
-        port = connectable.CreateInput(_prim_name(given.getName()), _sdf_type(given.getType()))
-        if not self._connect(port.GetAttr(), given, parent, container):
-            self._set(port.GetAttr(), given)
-        return port
 
-    def _connect(self, attribute: Usd.Attribute, port: Any, parent: Sdf.Path, container: Any) -> bool:
-        """Connect an attribute to what a port of MaterialX reads, if it reads anything."""
-        output = port.getOutputString() or "out"
-        if port.hasInterfaceName():
-            attribute.AddConnection(parent.AppendProperty(f"inputs:{_prim_name(port.getInterfaceName())}"))
-            return True
-        if port.getNodeGraphString():
-            graph = self._source.getNodeGraph(port.getNodeGraphString())
-            if graph is None:
-                return False
-            path = self._path.AppendChild(_prim_name(graph.getName()))
-            if not self._stage.GetPrimAtPath(path):
-                self._add_graph(graph, path, graph.getInputs(), self._path, self._source)
-            if not port.getOutputString() and graph.getOutputs():
-                output = graph.getOutputs()[0].getName()
-        else:
-            node = container.getNode(port.getNodeName()) if port.getNodeName() else None
-            if node is None:
-                return False
-            path = self._add_node(node, parent, container)
-        attribute.AddConnection(path.AppendProperty(f"outputs:{_prim_name(output)}"))
+def _add_input(material: UsdShade.Material, connectable: Any, given: Any, parent: Sdf.Path) -> Any:
+    port = connectable.CreateInput(_prim_name(given.getName()), _sdf_type(given.getType()))
+    if not _connect(material, port.GetAttr(), given, parent):
+        _set(port.GetAttr(), given)
+    return port
+
+
+def _connect(material: UsdShade.Material, attribute: Usd.Attribute, port: Any, parent: Sdf.Path) -> bool:
+    """Connect an attribute as a port of MaterialX; return whether the port has a connection."""
+    output = port.getOutputString() or "out"
+    if port.hasInterfaceName():
+        attribute.AddConnection(parent.AppendProperty(f"inputs:{_prim_name(port.getInterfaceName())}"))
         return True
+    if port.getNodeGraphString():
+        graph = port.getDocument().getNodeGraph(port.getNodeGraphString())
+        if graph is None:
+            return False
+        path = material.GetPath().AppendChild(_prim_name(graph.getName()))
+        if not material.GetPrim().GetStage().GetPrimAtPath(path):
+            _add_graph(material, graph, path, graph.getInputs(), material.GetPath())
+        if not port.getOutputString() and graph.getOutputs():
+            output = graph.getOutputs()[0].getName()
+    else:
+        # Outputs belong to the graph of their nodes, inputs to a node of it.
+        graph = port.getParent() if port.getCategory() == "output" else port.getParent().getParent()
+        node = graph.getNode(port.getNodeName()) if port.getNodeName() else None
+        if node is None:
+            return False
+        path = _add_node(material, node, parent)
+    attribute.AddConnection(path.AppendProperty(f"outputs:{_prim_name(output)}"))
+    return True
 
-    def _set(self, attribute: Usd.Attribute, given: MaterialX.Input) -> None:
-        kind, text = given.getType(), given.getValueString()
-        if not text:
-            return
-        if kind == "filename":
-            # Some documents repeat their file prefix in the name.
-            files = [_beside(path, self._document) for path in (given.getResolvedValueString(), text)]
-            there = [path for path in files if Ar.GetResolver().Resolve(path)]
-            attribute.Set(Sdf.AssetPath((there or files)[0]))
-        elif kind == "string":
-            attribute.Set(text)
-        elif kind in _TYPES:
-            value, type_of_usd = given.getValue(), type(attribute.GetTypeName().defaultValue)
-            attribute.Set(value if isinstance(value, (bool, int, float)) else type_of_usd(*value))
-        space = given.getActiveColorSpace()
-        if space and kind in ("filename", "color3", "color4"):
-            attribute.SetColorSpace(space)
+
+def _set(attribute: Usd.Attribute, given: MaterialX.Input) -> None:
+    kind, text = given.getType(), given.getValueString()
+    if not text:
+        return
+    if kind == "filename":
+        # Some documents repeat their file prefix in the name.
+        names, document = (given.getResolvedValueString(), text), given.getDocument().getSourceUri()
+        files = [_beside(name, document) for name in names]
+        attribute.Set(Sdf.AssetPath(next(filter(Ar.GetResolver().Resolve, files), files[0])))
+    elif kind == "string":
+        attribute.Set(text)
+    elif kind in _TYPES:
+        value, type_of_usd = given.getValue(), type(attribute.GetTypeName().defaultValue)
+        attribute.Set(value if isinstance(value, (bool, int, float)) else type_of_usd(*value))
+    space = given.getActiveColorSpace()
+    if space and kind in ("filename", "color3", "color4"):
+        attribute.SetColorSpace(space)
 
 
 def _sdf_type(kind: str) -> Sdf.ValueTypeName:
@@ -235,29 +225,27 @@ def _sdf_type(kind: str) -> Sdf.ValueTypeName:
 
 
 def _prim_name(name: str) -> str:
-    """Name of a prim; MaterialX has colons for namespaces."""
-    return name.replace(":", "__")
+    return name.replace(":", "__")  # MaterialX has colons for namespaces
 
 
 def has_materialx() -> bool:
-    """Whether the package materialx is there."""
+    """Whether the package materialx is installed."""
     return importlib.util.find_spec("MaterialX") is not None
 
 
 @cache
 def library() -> MaterialX.Document:
-    """Definitions of all nodes of the standard libraries."""
+    """Document with the definitions of the standard libraries."""
     import MaterialX
 
     document = MaterialX.createDocument()
-    path = MaterialX.getDefaultDataSearchPath()
     folders = [f"{root}/{name}" for root in MaterialX.getDefaultDataLibraryFolders() for name in _FOLDERS]
-    MaterialX.loadLibraries(folders, path, document)
+    MaterialX.loadLibraries(folders, MaterialX.getDefaultDataSearchPath(), document)
     return document
 
 
 def numbers(text: str, kind: str) -> float | list[float] | str:
-    """Value of MaterialX, of a type, as numbers; what is no number is an option."""
+    """Numbers of a value of MaterialX; or its text, an option."""
     if kind == "boolean":
         return float(text == "true")
     try:

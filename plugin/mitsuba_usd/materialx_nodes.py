@@ -1,8 +1,7 @@
-"""Nodes of MaterialX: what they compute, and expressions of them, with what is constant computed at once.
+"""Values of MaterialX nodes, and expressions of nodes with their constants folded.
 
-Values are arrays ``(..., k)`` with the channels of a type last. Nodes compute what the shaders of MaterialX 1.39 do
-(``libraries/stdlib/genglsl``); its node graphs are expanded elsewhere. Noises of points ``(..., 2)`` are those of Open
-Shading Language (``oslnoise.h``).
+Values are arrays ``(..., k)`` with the channels last, as in MaterialX 1.39 (``libraries/stdlib/genglsl``). Noises of
+points ``(..., 2)`` are those of Open Shading Language (``oslnoise.h``).
 """
 
 from __future__ import annotations
@@ -24,20 +23,19 @@ Hash = NDArray[np.uint32]
 CHANNELS = {
     "boolean": 1, "integer": 1, "float": 1, "vector2": 2, "vector3": 3, "color3": 3, "vector4": 4, "color4": 4,
 }  # fmt: skip
-# Luminance of linear Rec. 709.
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-# Scales Perlin noise to about -1 to 1.
-_PERLIN_SCALE = 0.6616
+PLUGIN = "mitsuba"  # Type of nodes that are plugins of Mitsuba
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Luminance of linear Rec. 709.
+_PERLIN_SCALE = 0.6616  # Scales Perlin noise to about -1 to 1
 # Offsets of the last components of noises, single ones and sums.
 _ELSEWHERE, _ELSEWHERE_IN_SUMS = np.array([19.0, 73.0]), np.array([19.0, 193.0])
 
-# Values (..., k) of a picture at texture coordinates (..., 2), or for None at the points of an evaluation.
+# Values (..., k) of an image at texture coordinates (..., 2); for None, at the points of the evaluation.
 Texels = Callable[[TextureContents, Values | None], Values]
 
 
 def fallback_of(texture: TextureContents, _texcoords: Values | None = None) -> Values:
-    """Values of a texture whose file cannot be read."""
-    return np.asarray(texture.fallback, dtype=np.float32)[texture.channels]
+    """Values of a texture without a readable file."""
+    return np.asarray(texture.fallback)[texture.channels]
 
 
 def evaluate(
@@ -47,7 +45,7 @@ def evaluate(
     # Derivatives (..., 2) of values (..., 1) along texture coordinates
     gradient: Callable[[Values], Values] = lambda values: np.zeros((len(values), 2)),
 ) -> Values:
-    """Values of an expression, ``(..., k)``; attributes of meshes are their fallbacks."""
+    """Values ``(..., k)`` of an expression, with the fallbacks of primvars."""
     known: dict[int, Values] = {}
 
     def value_of(part: Input) -> Any:
@@ -66,9 +64,7 @@ def evaluate(
             return np.asarray(part.fallback, dtype=np.float32)
         if part.category == "texcoord":
             return points
-        if part.category == "image":
-            file = part.inputs["file"]
-            assert isinstance(file, TextureContents)
+        if part.category == "image" and isinstance(file := part.inputs["file"], TextureContents):
             return texels(file, value_of(part.inputs["texcoord"]))
         inputs = {name: value_of(value) for name, value in part.inputs.items()}
         if part.category == "heighttonormal":
@@ -80,7 +76,7 @@ def evaluate(
 
 
 def operation(category: str, kind: str, inputs: Mapping[str, Any]) -> Values:
-    """Values of a node whose output has the type ``kind``. Raises MaterialError for inputs of other types."""
+    """Values of a node with the output type ``kind``. Raises MaterialError for inputs of other types."""
     named = {"in_" if name == "in" else name: value for name, value in inputs.items()}
     arguments = SimpleNamespace(**{**named, "kind": kind, "width": CHANNELS[kind]})
     try:
@@ -88,8 +84,7 @@ def operation(category: str, kind: str, inputs: Mapping[str, Any]) -> Values:
             values = np.asarray(OPERATIONS[category](arguments))
     except (IndexError, ValueError):
         raise MaterialError(f"{category} of {', '.join(inputs)} of other types") from None
-    # Shaders have no NaN.
-    return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)
+    return np.nan_to_num(values, nan=0.0, posinf=0.0, neginf=0.0)  # Shaders have no NaN
 
 
 def _unit(values: Values) -> Values:
@@ -149,16 +144,12 @@ def _with_alpha(color: Values, source: Values) -> Values:
 
 
 def _hsv(values: Values) -> Values:
-    """Hue, saturation and value of colours (Foley and van Dam)."""
     color = values[..., :3]
     most, least = color.max(axis=-1), color.min(axis=-1)
     delta = most - least
     red, green, blue = np.moveaxis(color, -1, 0)
-    sector = np.where(
-        red >= most,
-        (green - blue) / delta,
-        np.where(green >= most, 2 + (blue - red) / delta, 4 + (red - green) / delta),
-    )
+    beyond_red = np.where(green >= most, 2 + (blue - red) / delta, 4 + (red - green) / delta)
+    sector = np.where(red >= most, (green - blue) / delta, beyond_red)
     hue = np.where(delta > 0, (sector / 6) % 1.0, 0.0)
     saturation = np.where(most > 0, delta / most, 0.0)
     return _with_alpha(np.stack([hue, saturation, most], axis=-1), values)
@@ -172,7 +163,6 @@ def _rgb(values: Values) -> Values:
 
 
 def _blended(blend: Callable[[Values, Values], Values]) -> Callable[[SimpleNamespace], Values]:
-    """Blend of foreground and background, mixed with the background."""
     return lambda n: _mixed(n.bg, blend(n.fg, n.bg), n.mix)
 
 
@@ -182,14 +172,12 @@ def _extracted(n: SimpleNamespace) -> Values:
 
 
 def _roughness(n: SimpleNamespace) -> Values:
-    """GGX widths along the tangent and across it, of a roughness and an anisotropy."""
     squared = np.clip(n.roughness**2, 1e-8, 1)
     aspect = np.sqrt(1 - np.clip(n.anisotropy, 0, 0.98))
     return _stacked((np.minimum(squared / aspect, 1), squared * aspect))
 
 
 def _perlin(points: Values, width: int) -> Values:
-    """Gradient noise, of 1 to 4 components."""
     if width == 2:
         return _perlin(points, 3)[..., :2]
     if width == 4:
@@ -215,12 +203,11 @@ def _fractal(points: Values, n: SimpleNamespace, width: int) -> Values:
 
 
 def _cells(points: Values) -> Values:
-    """A random number from 0 to 1 for each unit square."""
     return _random_numbers(*np.moveaxis(np.floor(points).astype(np.int64), -1, 0))[..., None]
 
 
 def _worley(n: SimpleNamespace) -> Values:
-    """Distance to the nearest of random points, one in each unit square; with style 1, a random number of that one."""
+    """Distance to the nearest of random points, one in each unit square; with style 1, its random number."""
     cell = np.floor(n.texcoord)
     within = n.texcoord - cell
     column, row = np.moveaxis(cell.astype(np.int64), -1, 0)
@@ -237,7 +224,6 @@ def _worley(n: SimpleNamespace) -> Values:
 
 
 def _slope(hashed: Hash, x: Values, y: Values) -> Values:
-    """Product of an offset and one of 8 directions."""
     direction = hashed & 7
     u = np.where(direction < 4, x, y)
     v = 2 * np.where(direction < 4, y, x)
@@ -270,7 +256,6 @@ def _applied(of: Callable[..., Values], *names: str) -> Callable[[SimpleNamespac
     return lambda n: of(*(getattr(n, name) for name in names))
 
 
-# Functions of NumPy, of one value and of two.
 _OF_ONE = {
     "absval": np.abs, "floor": np.floor, "ceil": np.ceil, "sin": np.sin, "cos": np.cos, "tan": np.tan,
     "asin": np.arcsin, "acos": np.arccos, "sqrt": np.sqrt, "ln": np.log, "exp": np.exp, "sign": np.sign,
@@ -337,7 +322,7 @@ OPERATIONS: dict[str, Callable[[SimpleNamespace], Values]] = {
     "worleynoise2d": _worley,
     "roughness_anisotropy": _roughness,
 }
-# Sets of inputs in which an operation is affine per channel while its other inputs are constant.
+# Sets of inputs in which an operation is affine per channel if its other inputs are constant.
 AFFINE: dict[str, tuple[set[str], ...]] = {
     **dict.fromkeys(("add", "subtract", "combine2", "combine3", "combine4"), ({"in1", "in2", "in3", "in4"},)),
     **dict.fromkeys(("ifgreater", "ifgreatereq", "ifequal"), ({"in1", "in2"},)),
@@ -350,12 +335,10 @@ AFFINE: dict[str, tuple[set[str], ...]] = {
     "divide": ({"in1"},),
     "remap": ({"in"}, {"outlow", "outhigh"}),
 }
-# Categories that read texture coordinates or images.
-SAMPLED = ("texcoord", "image", "heighttonormal")
+SAMPLED = ("texcoord", "image", "heighttonormal")  # Categories that read texture coordinates or images
 
 
-def is_affine(category: str, varying: set[str]) -> bool:
-    """Whether an operation is affine in inputs that vary."""
+def _is_affine(category: str, varying: set[str]) -> bool:
     return any(varying <= names for names in AFFINE.get(category, ()))
 
 
@@ -382,12 +365,13 @@ def node_of(category: str, kind: str, given: dict[str, Input]) -> Input:
 
 
 def width_of(given: Input) -> int:
-    """How many numbers an input has."""
+    """Number of channels of an input."""
     if isinstance(given, NodeContents):
         return CHANNELS.get(given.type, 1)
-    if isinstance(given, (TextureContents, PrimvarContents)):
-        return len(given.channels if isinstance(given, TextureContents) else given.fallback)
-    return len(given) if isinstance(given, list) else 1
+    if isinstance(given, TextureContents):
+        return len(given.channel)
+    values = given.fallback if isinstance(given, PrimvarContents) else given
+    return len(values) if isinstance(values, list) else 1
 
 
 def is_constant(given: Input) -> bool:
@@ -396,17 +380,15 @@ def is_constant(given: Input) -> bool:
 
 
 def constant(given: Input, width: int | None = None) -> NDArray[np.float64]:
-    """Numbers ``(k,)`` of a constant input, maybe repeated to a width. Raises MaterialError for others."""
-    numbers = (
-        np.atleast_1d(np.asarray(given, dtype=np.float64)) if isinstance(given, (int, float, list)) else np.zeros(0)
-    )
+    """Numbers ``(k,)`` of a constant input, or one number repeated to a width. Raises MaterialError for others."""
+    numbers = np.atleast_1d(np.asarray(given if isinstance(given, (int, float, list)) else [], dtype=np.float64))
     if not numbers.size or (width is not None and numbers.size not in (1, width)):
         raise MaterialError(f"{given!r} is not {width or 'one'} number{'s' * (width not in (None, 1))}")
     return numbers if width is None else np.broadcast_to(numbers, (width,))
 
 
 def is_all(given: Input, value: float) -> bool:
-    """Whether an input is a number, or all channels of a colour are."""
+    """Whether all channels of an input are this number."""
     return is_constant(given) and not isinstance(given, str) and bool(np.all(np.asarray(given) == value))
 
 
@@ -431,8 +413,7 @@ def _without_effect(category: str, kind: str, given: dict[str, Input]) -> Input 
         if isinstance(first, (int, float)) and isinstance(second, (int, float)):
             chosen = given["in1" if _COMPARED[category](first, second) else "in2"]
     if chosen is not None and is_constant(chosen) and not isinstance(chosen, str):
-        # It may lack the width of the type.
-        return _plain(constant(chosen, CHANNELS[kind]))
+        return _plain(constant(chosen, CHANNELS[kind]))  # A single number stands for all channels
     return chosen
 
 
@@ -440,20 +421,17 @@ _COMPARED: dict[str, Callable[[float, float], bool]] = {
     "ifgreater": operator.gt, "ifgreatereq": operator.ge, "ifequal": operator.eq,
 }  # fmt: skip
 _VARYING = frozenset({"channel", "scale", "bias", "fallback"})
-# Channels of an image and a constant, by which affine functions are known: black, and each channel alone.
+# Values of four channels that determine an affine function: black, and each channel alone.
 _BASIS = np.vstack([np.zeros(4), np.eye(4)])
 
 
 def _picture(category: str, kind: str, given: dict[str, Input]) -> TextureContents | None:
-    """If the node is affine per channel in one image, that image with a new scale and bias; else None.
-
-    Channels of the image may be inputs of their own.
-    """
+    """If a node is affine per channel in one image, or in its channels, that image with a new scale and bias."""
     pictures = {name: value for name, value in given.items() if isinstance(value, TextureContents)}
     first = next(iter(pictures.values()), None)
     if first is None or not all(name in pictures or is_constant(value) for name, value in given.items()):
         return None
-    if not is_affine(category, set(pictures)) or not all(same(one, first, _VARYING) for one in pictures.values()):
+    if not _is_affine(category, set(pictures)) or not all(same(one, first, _VARYING) for one in pictures.values()):
         return None
 
     def on_basis(value: Input) -> Any:
@@ -468,8 +446,7 @@ def _picture(category: str, kind: str, given: dict[str, Input]) -> TextureConten
     if (np.count_nonzero(slopes, axis=0) != 1).any():
         return None
     if np.ptp(np.vstack([channels, values]), axis=1).max() == 0:
-        # One channel serves as a colour.
-        channels, columns = channels[:1], columns[:1]
+        channels, columns = channels[:1], columns[:1]  # One channel serves as a colour
     channel = "".join("rgba"[index] for index in channels)
     if channel not in ("r", "g", "b", "a", "rg", "rgb", "rgba"):
         return None
@@ -480,18 +457,16 @@ def _picture(category: str, kind: str, given: dict[str, Input]) -> TextureConten
 
 
 def affine_map(given: Input) -> NDArray[np.float64] | None:
-    """Matrix ``(3, 3)`` of an expression of texture coordinates if all its nodes are affine; else None."""
+    """Matrix ``(3, 3)`` of an expression of texture coordinates; None if a node is not affine."""
     for part in parts(given):
         if not isinstance(part, NodeContents):
             return None
         varying = {name for name, value in part.inputs.items() if not is_constant(value)}
-        if part.category != "texcoord" and not is_affine(part.category, varying):
+        if part.category != "texcoord" and not _is_affine(part.category, varying):
             return None
-    origin, u, v = np.broadcast_to(evaluate(given, _CORNERS), (3, 2)).astype(np.float64)
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    origin, u, v = np.broadcast_to(evaluate(given, corners), (3, 2)).astype(np.float64)
     return np.vstack([np.stack([u - origin, v - origin, origin], axis=1), [0, 0, 1]])
-
-
-_CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 
 
 def _plain(values: Values) -> float | list[float]:

@@ -1,4 +1,4 @@
-"""What a picture shows: triangles of limit surfaces that suffice for it, and pixels of textures."""
+"""Detail of a picture: triangles of limit surfaces and pixels of textures that suffice for it."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 from mitsuba_subdivision import studio
 from mitsuba_subdivision.cage import CageContents, CageError, ControlCage
@@ -16,20 +17,22 @@ from mitsuba_subdivision.schemes import SchemeError
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
 
+from .bsdfs import heights
 from .contents import NodeContents, SceneContents, ShapeContents, TextureContents, leaves
 from .scene_entries import Surfaces
-from .textures import samples_elsewhere
+from .stage_warnings import StageWarnings
+from .textures import Textures, samples_elsewhere
 
-# Texels for each pixel: filters see details of half a pixel, and glass magnifies.
-TEXELS_PER_PIXEL = 2.0
-# Parts of the edges of a mesh, as a few may have collapsed in the texture, and of texels; and edges that are measured.
+TEXELS_PER_PIXEL = 2.0  # Texels for each pixel: filters see details of half a pixel, and glass magnifies
+# Quantiles of edges, a few of which may have collapsed in the texture, and of texels; and most edges that are measured.
 _MOST_EDGES, _MOST_TEXELS, _MOST_SAMPLES = 0.95, 0.99, 20_000
 # Outlines of sensors and the distances of their near planes; see `outline_for`.
 Views = Sequence[tuple[SceneNode, float]]
+_CONSTANT = "vertex_constant_displacement"  # Attribute of shapes whose displacement is constant
 
 
 def with_rate(parameters: dict[str, Any], contents: SceneContents) -> dict[str, Any]:
-    """Parameters of every limit surface, with as many segments on each edge as most triangles allow by default."""
+    """Parameters of every limit surface, with the default number of segments on each edge."""
     if is_chosen(parameters):
         return parameters
     corners = sum(int(shape.cage.face_sizes.sum()) for shape in contents.all_shapes if shape.cage.scheme is not None)
@@ -39,7 +42,7 @@ def with_rate(parameters: dict[str, Any], contents: SceneContents) -> dict[str, 
 
 
 def is_chosen(parameters: dict[str, Any]) -> bool:
-    """Whether the parameters of limit surfaces determine their tessellation."""
+    """Whether parameters determine the tessellation."""
     return bool({"tessellation_rate", "tessellation"} & parameters.keys())
 
 
@@ -47,14 +50,13 @@ def triangles_for_picture(
     contents: SceneContents,
     segments: Mapping[ShapeContents, IntArray],  # dict of (n,) int array by shape: see `segments_of`
     outline: SceneNode,  # Of the sensor; see `outline_for`
-    parameters: dict[str, Any],  # Of every limit surface: the shading, and how many segments there are at most
+    parameters: dict[str, Any],  # Of every limit surface, with the shading and the highest uniform rate
     *,
-    follows_sensor: bool = True,  # Whether the scene is rendered by this sensor only
+    follows_sensor: bool = True,  # Whether no other sensor renders the scene
 ) -> dict[ShapeContents, dict[str, Any]]:
-    """Parameters of limit surfaces with the fewest triangles whose facets do not show in an image.
+    """Parameters of usable limit surfaces with the fewest triangles whose facets do not show in an image.
 
-    With exact shading, those outside groups may be adaptive; displaced ones are not, as they have no known outline.
-    Cages that cannot be used are missing.
+    With exact shading, surfaces outside groups may be adaptive, unless they are displaced: their outline is unknown.
     """
     most = parameters["tessellation_rate"]
     needed = {shape: int(segments[shape].max()) for shape in contents.all_shapes if shape in segments}
@@ -73,59 +75,46 @@ def triangles_for_picture(
 def segments_of(
     contents: SceneContents, surfaces: Surfaces, outline: SceneNode, near_clip: float, shading: str
 ) -> dict[ShapeContents, IntArray]:
-    """Segments on each edge that a picture needs, ``(n,)``, of the copies of each usable limit surface.
-
-    See `segments_for`; copies are in the order of ``contents.placed_shapes``.
-    """
-    of_shape: dict[ShapeContents, list[NDArray[np.float64]]] = {}
-    for shape, to_world in contents.placed_shapes:
-        if shape.cage.scheme is not None:
-            of_shape.setdefault(shape, []).append(to_world)
+    """Segments on each edge that a picture needs, ``(n,)``, for each placement of usable limit surfaces."""
+    placements = {shape: matrices for shape, matrices in contents.placements.items() if shape.cage.scheme is not None}
     of_cage: dict[ControlCage, list[ShapeContents]] = {}
-    for shape in of_shape:
+    for shape in placements:
         with suppress(CageError, SchemeError):
-            of_cage.setdefault(surfaces.of(shape.cage).surface.cage, []).append(shape)
+            of_cage.setdefault(surfaces.of(shape.cage).cage, []).append(shape)
     needed: dict[ShapeContents, IntArray] = {}
     for cage, alike in of_cage.items():
-        copies = np.concatenate([of_shape[shape] for shape in alike])
-        counts = [len(of_shape[shape]) for shape in alike]
+        copies = np.concatenate([placements[shape] for shape in alike])
+        counts = [len(placements[shape]) for shape in alike]
         segments = np.split(studio.segments_for(cage, copies, outline, near_clip, shading), np.cumsum(counts)[:-1])
         needed |= dict(zip(alike, segments, strict=True))
     return needed
 
 
 def texels_for_pictures(contents: SceneContents, sensors: Sequence[SceneNode]) -> dict[str, float]:
-    """Pixels along the sides of textures that pictures by sensors show at most, by file; of tiles, along those of each.
+    """Most pixels along the sides of each image file, or of its tiles, that pictures by sensors show.
 
     Files of unknown detail are missing, or infinite.
     """
     seen = [(studio.outline_for(sensor), sensor["near_clip"]) for sensor in sensors]
-    matrices: dict[ShapeContents, list[NDArray[np.float64]]] = {}
-    for shape, to_world in contents.placed_shapes:
-        if shape.material is not None:
-            matrices.setdefault(shape, []).append(to_world)
     needed: dict[str, float] = {}
-    for shape, copies in matrices.items():
-        texels = TEXELS_PER_PIXEL * _pixels_of_texcoords(shape.cage, np.stack(copies), seen)
-        inputs = shape.material.inputs.values() if shape.material else ()
-        # Where pictures are read at computed coordinates, the detail is unknown.
+    for shape, copies in contents.placements.items():
+        if shape.material is None:
+            continue
+        lengths, in_texture = (np.linalg.norm(vectors, axis=1) for vectors in _edges(shape.cage))
+        there, texels = in_texture > 0, np.inf
+        if there.any():
+            scale = float(np.quantile(lengths[there] / in_texture[there], _MOST_EDGES))
+            texels = TEXELS_PER_PIXEL * scale * pixels_of(shape.cage, copies, seen)
+        inputs = shape.material.inputs.values()
+        # Images at computed texture coordinates have an unknown detail.
         known = [given for given in inputs if not (isinstance(given, NodeContents) and samples_elsewhere(given))]
         for texture in (leaf for given in known for leaf in leaves(given)):
             if isinstance(texture, TextureContents):
-                # Pictures along a unit of texture coordinates.
+                # Repetitions of the image along a unit of texture coordinates.
                 repeats = np.linalg.norm(texture.to_uv[:2, :2], axis=0).max()
                 most = texels / repeats if repeats > 0 else np.inf
                 needed[texture.file] = max(most, needed.get(texture.file, 0.0))
     return needed
-
-
-def _pixels_of_texcoords(cage: CageContents, to_world: NDArray[np.float64], seen: Views) -> float:
-    """Maximum pixels of a unit of texture coordinates, for most edges of copies ``(n, 4, 4)``; infinite if unknown."""
-    lengths, in_texture = (np.linalg.norm(vectors, axis=1) for vectors in _edges(cage))
-    there = in_texture > 0
-    if not there.any():
-        return np.inf
-    return pixels_of(cage, to_world, seen) * float(np.quantile(lengths[there] / in_texture[there], _MOST_EDGES))
 
 
 def _edges(cage: CageContents) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -137,15 +126,12 @@ def _edges(cage: CageContents) -> tuple[NDArray[np.float64], NDArray[np.float64]
     ends = np.stack([corners, topology.next[corners]])
     vertices, indices = topology.face_vertices[ends], cage.texcoords.indices
     index = vertices if indices is None else np.asarray(indices)[ends]
-    along, in_texture = (
-        np.diff(np.asarray(values, dtype=np.float64)[rows], axis=0)[0]
-        for values, rows in ((cage.positions, vertices), (cage.texcoords.values, index))
-    )
-    return along, in_texture
+    pairs = np.asarray(cage.positions, np.float64)[vertices], np.asarray(cage.texcoords.values, np.float64)[index]
+    return pairs[0][1] - pairs[0][0], pairs[1][1] - pairs[1][0]
 
 
 def pixels_of(cage: CageContents, to_world: NDArray[np.float64], seen: Views) -> float:
-    """Maximum pixels of a unit of a mesh, over its copies ``(n, 4, 4)`` and views."""
+    """Maximum pixels per unit of a mesh, over its copies ``(n, 4, 4)`` and views."""
     box = np.stack([cage.positions.min(axis=0), cage.positions.max(axis=0)]).astype(np.float64)
     corners_of_copies = points_at(box_corners(box), to_world)
     pixels = np.max([studio.pixels_of_boxes(corners_of_copies, *view) for view in seen], axis=0)
@@ -153,11 +139,10 @@ def pixels_of(cage: CageContents, to_world: NDArray[np.float64], seen: Views) ->
 
 
 def rate_of_heights(cage: CageContents, texture: SceneNode, error: float) -> int:
-    """Segments on each edge with which chords are within an error of most heights of a bitmap of one channel."""
+    """Segments on each edge whose chords are within an error of most heights of a bitmap of one channel."""
     pixels = np.array(texture["bitmap"])
     heights = pixels.reshape(pixels.shape[:2]) / (255.0 if pixels.dtype == np.uint8 else 1.0)
-    # In texels, powers of two.
-    length = 1
+    length = 1  # In texels, powers of two
     while 4 * length <= min(heights.shape):
         away = [np.abs(h[2 * length :] + h[: -2 * length] - 2 * h[length:-length]) / 2 for h in (heights, heights.T)]
         if max(np.quantile(part, _MOST_TEXELS) for part in away) > error:
@@ -166,3 +151,55 @@ def rate_of_heights(cage: CageContents, texture: SceneNode, error: float) -> int
     to_texels = np.array(texture["to_uv"].matrix)[:2, :2] * np.array(heights.shape[::-1])[:, None]
     texels = np.abs(_edges(cage)[1] @ to_texels.T).max(axis=1)
     return max(1, math.ceil(float(np.quantile(texels, _MOST_EDGES)) / length))
+
+
+def with_own_parameters(
+    contents: SceneContents,
+    chosen: Mapping[ShapeContents, dict[str, Any]],  # Of some limit surfaces
+    parameters: dict[str, Any],  # Of other limit surfaces; a displacement replaces the displacements of materials
+    sensors: Sequence[SceneNode] | None,  # Sensors of the pictures; empty if they are unknown, None to keep the rates
+    textures: Textures,
+    notes: StageWarnings,
+) -> dict[ShapeContents, dict[str, Any]]:
+    """Parameters of limit surfaces with the displacements of their materials, at rates that show them, or own rates."""
+    shapes = [shape for shape in contents.all_shapes if shape.is_displaced and "displacement" not in parameters]
+    placements = contents.placements if shapes else {}
+    corners = sum(len(shape.cage.face_vertices) for shape in shapes)
+    highest = min(math.isqrt(2 * studio.MOST_TRIANGLES // max(corners, 1)), studio.HIGHEST_RATE)
+    seen = [(studio.outline_for(sensor), sensor["near_clip"]) for sensor in sensors or () if shapes]
+    displaced = {**chosen}
+    textures.read(texture for shape in shapes if shape.material for texture in shape.material.textures())
+    for shape in shapes:
+        displaced[shape] = {**chosen.get(shape, parameters), **_displacement(shape, textures, notes)}
+        texture = displaced[shape].get("displacement")
+        if sensors is not None and shape in placements and texture is not None:
+            rate = displaced[shape]["tessellation_rate"]
+            if isinstance(texture, str):
+                rate = rate if texture == _CONSTANT else max(rate, studio.MOST_SEGMENTS)
+            elif "bitmap" not in texture:
+                rate = 8 * studio.MOST_SEGMENTS
+            else:
+                pixels = pixels_of(shape.cage, placements[shape], seen) if seen else np.inf
+                error = studio.ERRORS[parameters["shading"]] / pixels
+                rate = max(rate, rate_of_heights(shape.cage, texture, error))
+            displaced[shape]["tessellation_rate"] = max(1, min(rate, highest))
+    for shape in contents.all_shapes if sensors is not None else ():
+        if shape.rate is not None and shape.cage.scheme is not None:
+            own = {name: displaced[shape][name] for name in displaced.get(shape, ()) if "displacement" in name}
+            displaced[shape] = {**parameters, **own, "tessellation_rate": shape.rate}
+    return displaced
+
+
+def _displacement(shape: ShapeContents, textures: Textures, notes: StageWarnings) -> dict[str, Any]:
+    """Parameters of the shape ``subdivision``: a texture, or an attribute, also for a constant."""
+    given, scale = heights(shape, textures, notes)
+    if isinstance(given, float):
+        values = np.full((len(shape.cage.positions), 1), given * scale)
+        return {_CONSTANT: mi.TensorXf(values), "displacement": _CONSTANT} if given * scale else {}
+    if given["type"] != "mesh_attribute":
+        return {"displacement": given}
+    name = given["name"].removeprefix("vertex_")
+    if shape.cage.attributes[name].values.shape[1] != 1:
+        notes.add(f'displacement by the primvar "{name}" is ignored; expected one number per value', shape.name)
+        return {}
+    return {"displacement": given["name"], "displacement_scale": scale}

@@ -1,4 +1,4 @@
-"""Contents of a stage in another unit, with the same picture: light leaks below small models (`enlargement`)."""
+"""Contents of a stage in a larger unit, with the same picture: light leaks below small models (`enlargement`)."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _WITHOUT_PLACE = ("distant", "dome")
 def size_of(contents: SceneContents) -> float:
     """The largest side of a box around all control points; 0 if there are none."""
     boxes = [
-        points_at(box_corners(np.stack([shape.cage.positions.min(axis=0), shape.cage.positions.max(axis=0)])), matrix)
-        for shape, matrix in contents.placed_shapes
-        if len(shape.cage.positions)
+        points_at(box_corners(np.stack([points.min(axis=0), points.max(axis=0)])), matrices).reshape(-1, 3)
+        for shape, matrices in contents.placements.items()
+        if len(points := shape.cage.positions)
     ]
     return float(np.ptp(np.concatenate(boxes), axis=0).max()) if boxes else 0.0
 
@@ -40,7 +40,7 @@ def scaled(contents: SceneContents, factor: float) -> SceneContents:
         return replace(shape, to_world=matrix @ shape.to_world, material=of_material(shape.material), radiance=radiance)
 
     def of_light(light: LightContents) -> LightContents:
-        # What is given for a whole lamp is divided by its area, or by the square of the distance.
+        # Power is divided by the area of the light, or by the square of the distance.
         grows = light.is_normalized and light.kind not in _WITHOUT_PLACE
         emission = (np.array(light.emission) * factor**2).tolist() if grows else light.emission
         return replace(light, to_world=scale @ light.to_world, emission=emission)
@@ -57,12 +57,11 @@ def scaled(contents: SceneContents, factor: float) -> SceneContents:
 
 
 def scaled_camera(camera: CameraContents, factor: float) -> CameraContents:
-    """A camera with all lengths of the world multiplied by a factor; a film of a perspective one stays."""
+    """A camera with all lengths of the world multiplied by a factor; the film of a perspective camera stays."""
     to_world = camera.to_world.copy()
     to_world[:3, 3] *= factor
     film = 1.0 if camera.is_perspective else factor
-    changed: dict[str, Any] = {
-        name: factor * getattr(camera, name) for name in ("near", "far", "lens_radius", "focus_distance")
-    }
+    lengths = ("near", "far", "lens_radius", "focus_distance")
+    changed: dict[str, Any] = {name: factor * getattr(camera, name) for name in lengths}
     changed |= {name: [film * length for length in getattr(camera, name)] for name in ("aperture", "offset")}
     return replace(camera, to_world=to_world, **changed)

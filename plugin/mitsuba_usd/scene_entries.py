@@ -1,4 +1,4 @@
-"""Shapes, materials, instances and lights of a stage as entries of a scene, or as objects kept from frame to frame."""
+"""Scene entries of shapes, materials, instances and lights, or objects that are kept from frame to frame."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import warnings
 import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import replace
+from functools import cache, partial
 from typing import Any
 
 import mitsuba as mi
@@ -40,31 +40,27 @@ from .sensors import RESERVED
 from .stage_warnings import StageWarnings
 from .textures import Textures
 
-# Faces from which on control points stand for the surface: a sphere with 64 around is smaller by a six-hundredth.
+# Faces of cages whose control points stand for the surface: a sphere with 64 around is smaller by a six-hundredth.
 DENSE = 2_000
 _NO_POINTS: NDArray[np.float64] = np.zeros((0, 3))
-# Fields of a shape that may differ between frames that share an object.
-_MOVABLE = frozenset({"cage", "to_world"})
+_MOVABLE = frozenset({"cage", "to_world"})  # Fields of a shape that may differ between frames that share an object
 
 
 def scene_entries(
     contents: SceneContents,
-    rest: SceneNode,  # Entries of the integrator, the sensor and a studio; none where nothing can be seen
+    rest: SceneNode,  # Entries of the integrator, the sensor and a studio; empty if nothing is visible
     notes: StageWarnings,
     parameters: dict[str, Any],  # Of every shape `subdivision`; see `with_rate`
-    surfaces: Surfaces,  # Provides the limit surfaces
+    surfaces: Surfaces,
     textures: Textures,
-    # Parameters of some limit surfaces, in place of those of all
-    chosen: Mapping[ShapeContents, dict[str, Any]] | None = None,
-    loaded: LoadedShapes | None = None,  # If given, its objects are used as shapes
+    chosen: Mapping[ShapeContents, dict[str, Any]] | None = None,  # Own parameters of some limit surfaces
+    loaded: LoadedShapes | None = None,  # Objects in place of entries of shapes
 ) -> SceneNode:
-    """Scene entries of a stage and the rest; polygon meshes are those of `PolygonMesh`."""
+    """Scene entries of a stage and the rest, with polygon meshes as `PolygonMesh`."""
     scene: SceneNode = {"type": "scene"}
-    # Keys of BSDFs that are the same for all shapes, by material.
-    shared: dict[MaterialContents, str] = {}
+    shared: dict[MaterialContents, str] = {}  # Keys of BSDFs without primvars, by material
 
     def add(name: str, entry: Any) -> str:
-        """Add an entry with the name of a prim, and return its key."""
         key = base = re.sub(r"\W", "_", name.strip("/"))
         number = 1
         while key in scene or key in RESERVED:
@@ -95,14 +91,14 @@ def scene_entries(
         return entry({"type": "ref", "id": shared[material]})
 
     def shown(shape: ShapeContents) -> SceneNode | mi.Object | None:
-        """A shape; None if it cannot be used, with a warning."""
+        """A shape; None, with a warning, if it is unusable."""
         try:
-            shining = None if shape.radiance is None else rgb(np.array(shape.radiance) / _light_area(shape))
-            if shining is None and shape.material is not None:
-                shining = radiance(shape.material, textures, notes)
-            if shining is not None and shape.curves is not None:
+            emitted = None if shape.radiance is None else rgb(np.array(shape.radiance) / _light_area(shape))
+            if emitted is None and shape.material is not None:
+                emitted = radiance(shape.material, textures, notes)
+            if emitted is not None and shape.curves is not None:
                 notes.add("emission of curves is ignored; Mitsuba's curves are no lights", shape.name)
-            area = None if shining is None else {"type": "area", "radiance": shining}
+            area = None if emitted is None else {"type": "area", "radiance": emitted}
             return made(shape, area)
         except SchemeError as error:
             notes.add_message(f"{error}; the mesh is shown as polygons", shape.name)
@@ -121,10 +117,9 @@ def scene_entries(
         groups.append(add(f"group_{number}", {"type": "shapegroup", **shapes}) if shapes else None)
     for instance in contents.instances:
         if groups[instance.group] is not None:
-            place = mi.ScalarTransform4f(instance.to_world.tolist())
-            group_of = {"type": "ref", "id": groups[instance.group]}
-            add(instance.name, {"type": "instance", "group": group_of, "to_world": place})
-    # With it, and with a dome, lights are found behind shapes of other lights that are clear.
+            entry = {"type": "instance", "to_world": mi.ScalarTransform4f(instance.to_world.tolist())}
+            add(instance.name, {**entry, "group": {"type": "ref", "id": groups[instance.group]}})
+    # The integrator volpath, or a dome, finds lights behind clear shapes of other lights.
     has_dome = any(light.kind == "dome" for light in contents.lights)
     are_clear = has_dome or (bool(rest) and rest["integrator"]["type"] == "volpath")
     for light in one_environment(contents.lights, notes):
@@ -133,56 +128,33 @@ def scene_entries(
     return {**scene, **rest}
 
 
-@dataclass(frozen=True, eq=False)
-class CachedSurface:
-    """A limit surface with the warnings about its cage."""
-
-    contents: CageContents
-    surface: LimitSurface
-    warnings: list[str]
-
-    @cached_property
-    def properties(self) -> SceneNode:
-        """Properties of the shape ``subdivision`` that describe the cage."""
-        return self.surface.cage.as_properties(mi)
-
-    def points_of(self, positions: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points on or around the surface of these control points."""
-        return positions[self._used] if self._frame_table is None else self._frame_table.apply(positions)[0]
-
-    @cached_property
-    def _frame_table(self) -> Any:
-        return frame_table(self.surface) if self.surface.cage.face_count < DENSE else None
-
-    @cached_property
-    def _used(self) -> NDArray[np.bool_]:
-        cage = self.surface.cage
-        is_hole = np.isin(np.arange(cage.face_count), cage.holes)
-        return np.isin(np.arange(cage.vertex_count), cage.face_vertices[np.repeat(~is_hole, cage.face_sizes)])
-
-
 class Surfaces:
     """Caches limit surfaces: the left and the right bishop, black or white, share one."""
 
     def __init__(self) -> None:
-        self._known: dict[tuple[int, ...], list[CachedSurface]] = {}
-        # Of shapes whose control points may be others at other times.
-        self._of_shape: dict[tuple[str, str | None], CachedSurface] = {}
+        self._known: dict[tuple[int, ...], list[tuple[CageContents, LimitSurface]]] = {}
+        # By names of shape and material, for frames with other control points.
+        self._of_shape: dict[tuple[str, str | None], tuple[CageContents, LimitSurface]] = {}
+        self.messages: dict[LimitSurface, list[str]] = {}  # Warnings about the cages of surfaces
+        # Properties of the shape `subdivision` for a cage.
+        self.properties = cache(lambda surface: surface.cage.as_properties(mi))
+        self._sampling = cache(_sampling)
 
-    def of(self, contents: CageContents) -> CachedSurface:
+    def of(self, contents: CageContents) -> LimitSurface:
         """The surface of a cage, without warnings. Raises CageError, or SchemeError if the scheme is the reason."""
         key = len(contents.positions), len(contents.face_sizes), zlib.crc32(contents.positions.tobytes())
         alike = self._known.setdefault(key, [])
-        for known in alike:
-            if same(known.contents, contents):
-                return known
+        for known, surface in alike:
+            if same(known, contents):
+                return surface
         with noting_warnings() as messages, without_warnings():
             surface = LimitSurface(ControlCage.from_arrays(**contents.as_arguments()))
-        alike.append(CachedSurface(contents, surface, messages))
-        return alike[-1]
+        alike.append((contents, surface))
+        self.messages[surface] = messages
+        return surface
 
     def points(self, contents: SceneContents) -> NDArray[np.float64]:
-        """Points ``(n, 3)`` in the world: on limit surfaces or around them, of other shapes, and boxes of groups."""
+        """Points ``(n, 3)`` in the world: of shapes, on or around limit surfaces, and of boxes of groups."""
         of_shapes = [self._points_of(shape) for shape in counted(contents.shapes, "Limit surfaces")]
         boxes = []
         for group in contents.groups:
@@ -196,17 +168,26 @@ class Surfaces:
         cage, key = shape.cage, (shape.name, shape.material.name if shape.material else None)
         if cage.scheme is None:
             return points_at(cage.positions, shape.to_world)
-        known = self._of_shape.get(key)
-        if known is None or not same_topology(known.contents, cage):
+        if key not in self._of_shape or not same_topology(self._of_shape[key][0], cage):
             try:
-                known = self._of_shape[key] = self.of(cage)
+                self._of_shape[key] = cage, self.of(cage)
             except SchemeError:
-                # Shown as polygons.
-                return points_at(cage.positions, shape.to_world)
+                return points_at(cage.positions, shape.to_world)  # Shown as polygons
             except CageError:
-                # Entries are made of it later, with the error.
-                return _NO_POINTS
-        return points_at(known.points_of(np.asarray(cage.positions, dtype=np.float64)), shape.to_world)
+                return _NO_POINTS  # Its entry issues the error
+        sampled = self._sampling(self._of_shape[key][1])(np.asarray(cage.positions, dtype=np.float64))
+        return points_at(sampled, shape.to_world)
+
+
+def _sampling(surface: LimitSurface) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Function from control points ``(n, 3)`` to points on or around the surface."""
+    cage = surface.cage
+    if cage.face_count < DENSE:
+        table = frame_table(surface)
+        return lambda positions: table.apply(positions)[0]
+    is_hole = np.isin(np.arange(cage.face_count), cage.holes)
+    used = np.isin(np.arange(cage.vertex_count), cage.face_vertices[np.repeat(~is_hole, cage.face_sizes)])
+    return lambda positions: positions[used]
 
 
 def subdivision(
@@ -218,15 +199,14 @@ def subdivision(
     notes: StageWarnings,
 ) -> SceneNode:
     """A limit surface. Raises CageError for an invalid cage, SchemeError if the scheme cannot subdivide it."""
-    # Validated here, so that messages name the prim.
-    surface = surfaces.of(shape.cage)
-    for message in surface.warnings:
-        notes.add_message(message.replace(surface.contents.source.name, shape.cage.source.name), shape.name)
+    surface = surfaces.of(shape.cage)  # Validated here, so that messages name the prim
+    for message in surfaces.messages[surface]:
+        notes.add_message(message.replace(surface.cage.source.name, shape.cage.source.name), shape.name)
     tensor: Any = mi.TensorXu  # The stubs call it an object
     shown = shape.shown_faces
     return {
         "type": "subdivision",
-        **surface.properties,
+        **surfaces.properties(surface),
         "cage_name": shape.cage.source.name,
         **({} if shown is None else {"shown_faces": tensor(shown.astype(np.uint32))}),
         **parameters,
@@ -237,7 +217,7 @@ def subdivision(
 
 
 def _light_area(shape: ShapeContents) -> float:
-    """Area of a normalized light in the world, with all its faces; 1 for others."""
+    """Area of a normalized mesh light in the world, with all its faces; 1 for other lights."""
     if not shape.is_normalized:
         return 1.0
     cage = replace(shape.cage, positions=points_at(np.asarray(shape.cage.positions, np.float64), shape.to_world))
@@ -257,7 +237,7 @@ def as_polygons(shape: ShapeContents) -> ShapeContents:
 
 
 def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
-    """Triangles of a shape that is not to be subdivided."""
+    """Triangles of a polygon mesh."""
     cage, normals = shape.cage, shape.normals
     corners, face = triangle_corners(cage.positions, cage.face_sizes, cage.face_vertices)
     corners = corners[~np.isin(face, cage.holes)]
@@ -265,8 +245,7 @@ def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
     if cage.texcoords is not None:
         data["texcoords"] = cage.texcoords
     if normals is not None or any(attribute.interpolation == "face_varying" for attribute in data.values()):
-        # Every corner of a face is a vertex of its own.
-        vertex, triangles = cage.face_vertices, corners
+        vertex, triangles = cage.face_vertices, corners  # Every corner of a face is a vertex of its own
     else:
         vertex, triangles = np.arange(len(cage.positions)), cage.face_vertices[corners]
     matrix = shape.to_world
@@ -283,7 +262,7 @@ def polygon_mesh(shape: ShapeContents) -> PolygonMesh:
 
 
 class LoadedShapes:
-    """Objects of shapes in successive frames. Limit surfaces that only move keep theirs; other shapes are rebuilt."""
+    """Objects of shapes in successive frames. Limit surfaces that only move keep theirs; other objects are rebuilt."""
 
     def __init__(self) -> None:
         self._before: dict[tuple[str, int], tuple[ShapeContents, mi.Object]] = {}
@@ -292,23 +271,23 @@ class LoadedShapes:
         self._bsdfs: list[tuple[MaterialContents, mi.BSDF]] = []
 
     def begin_frame(self) -> None:
-        """Begin the next frame, and free objects that the last one did not use."""
+        """Begin the next frame, and free the objects that the last one did not use."""
         self._before, self._now, self._counts = self._now, {}, Counter()
         materials = {shape.material for shape, _ in self._before.values()}
         self._bsdfs = [pair for pair in self._bsdfs if pair[0] in materials]
 
     def object_of(
-        self,
-        shape: ShapeContents,
-        entry: Callable[[SceneNode], SceneNode],  # Makes the entry of the shape with a BSDF
-        bsdf: Callable[[], SceneNode],  # Makes the entry of its BSDF
+        self, shape: ShapeContents, entry: Callable[[SceneNode], SceneNode], bsdf: Callable[[], SceneNode]
     ) -> mi.Object:
-        """The object of a shape; errors are those of `subdivision`."""
-        # Several shapes have one name if a mesh has several materials, or if groups have equal shapes.
+        """The object of a shape, from functions that return its entry with a BSDF, and the entry of the BSDF.
+
+        Raises CageError, SchemeError as `subdivision` does.
+        """
+        # Parts of a mesh with several materials, and equal shapes of groups, share a name.
         self._counts[shape.name] += 1
         key = shape.name, self._counts[shape.name]
         known = self._before.get(key)
-        is_there = (
+        stays = (
             known is not None
             and np.array_equal(known[0].to_world, shape.to_world)
             and np.array_equal(known[0].cage.positions, shape.cage.positions)
@@ -317,10 +296,11 @@ class LoadedShapes:
             known is None
             or not same(known[0], shape, _MOVABLE)
             or not same_topology(known[0].cage, shape.cage)
-            or (shape.cage.scheme is None and not is_there)
+            or (shape.cage.scheme is None and not stays)
         ):
-            known = shape, self._loaded(shape.material, entry, bsdf)
-        elif not is_there:
+            # The cage is validated before the BSDF is made, so that warnings name the prim.
+            known = shape, self._loaded(shape.material, entry({}), bsdf)
+        elif not stays:
             positions = np.asarray(shape.cage.positions, dtype=np.float64)
             if not np.isfinite(positions).all():
                 raise CageError(f"{shape.cage.source.name}: points are not finite; expected finite numbers")
@@ -330,20 +310,13 @@ class LoadedShapes:
         self._now[key] = known
         return known[1]
 
-    def _loaded(
-        self,
-        material: MaterialContents | None,
-        entry: Callable[[SceneNode], SceneNode],
-        bsdf: Callable[[], SceneNode],
-    ) -> mi.Object:
-        # The cage is validated before the BSDF is made, so that warnings name the prim.
-        made = entry({})
-        # Shared by all shapes of a material, unless it reads their attributes.
-        alike = (loaded for known, loaded in self._bsdfs if same(known, material))
-        loaded = None if material is None or material.primvars() else next(alike, None)
+    def _loaded(self, material: MaterialContents | None, made: SceneNode, bsdf: Callable[[], SceneNode]) -> mi.Object:
+        # Shapes of a material without primvars share its BSDF.
+        shared = None if material is None or material.primvars() else material
+        loaded = next((loaded for known, loaded in self._bsdfs if same(known, shared)), None)
         if loaded is None:
             loaded = mi.load_dict(bsdf())
-            self._bsdfs += [] if material is None or material.primvars() else [(material, loaded)]
+            self._bsdfs += [] if shared is None else [(shared, loaded)]
         if "mesh" in made:
             parts = (mi.load_dict(made[name]) if name in made else None for name in ("emitter", "interior"))
             return made["mesh"].loaded(loaded, *parts)

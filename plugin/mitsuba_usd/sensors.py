@@ -1,4 +1,4 @@
-"""A USD camera as a sensor of Mitsuba; and camera, lights and backdrop of a studio for a stage that lacks them."""
+"""A USD camera as a sensor of Mitsuba, and the studio's camera, lights and backdrop for stages without them."""
 
 from __future__ import annotations
 
@@ -16,26 +16,24 @@ from .emitters import are_lamps_in_the_way
 from .stage_warnings import StageWarnings
 
 _LEAST_NEAR = 1e-6
-# Of single scenes.
 NO_BLUR = "shutters of cameras have no effect without the option --shutter of render"
 # Default width of pictures by a stage's camera, in pixels.
 WIDTH = 640
 RESERVED = ("integrator", "sensor", *STUDIO, ENVIRONMENT)
-# Minimum half-extent of the framed content, relative to its position.
-_LEAST_SIZE = 1e-6
+_LEAST_SIZE = 1e-6  # Minimum half-extent of the framed content, relative to its position
 
 
 def sensor(
     camera: CameraContents, size: tuple[int, int], picture: PictureContents, spp: int | None, notes: StageWarnings
 ) -> SceneNode:
-    """A sensor with a film (width, height) of the camera's aperture, and parameters of Mitsuba that the prim has."""
+    """A sensor with a film (width, height) of the camera's aperture, and the authored parameters of Mitsuba."""
     own, stated = _sensor(camera, size, spp, notes), camera.mitsuba
     stated = {**own, **stated, "film": {**own["film"], **stated.get("film", {})}} if stated else own
     return cropped(_accepted(stated, own, "mitsuba:sensor", camera.name, notes), picture.window)
 
 
 def _accepted(stated: SceneNode, own: SceneNode, what: str, prim: str, notes: StageWarnings) -> SceneNode:
-    """An entry with parameters that a prim has, or the own one if Mitsuba does not take them."""
+    """The stated entry, or the own one, with a warning, if Mitsuba cannot load it."""
     try:
         return stated if stated is own or mi.load_dict(stated) else own
     except RuntimeError as error:
@@ -44,7 +42,7 @@ def _accepted(stated: SceneNode, own: SceneNode, what: str, prim: str, notes: St
 
 
 def cropped(sensor: SceneNode, window: list[float]) -> SceneNode:
-    """A sensor that renders the pixels whose centres are in a window; see `PictureContents`."""
+    """A sensor that renders the pixels with centres in a window; see `PictureContents`."""
     film, (left, below, right, above) = sensor["film"], window
     if window == WHOLE:
         return sensor
@@ -72,11 +70,10 @@ def _sensor(camera: CameraContents, size: tuple[int, int], spp: int | None, note
         return {"type": "orthographic", "to_world": mi.ScalarTransform4f(matrix.tolist()), **common}
     common["to_world"] = mi.ScalarTransform4f((camera.to_world @ np.diag([-1.0, 1, -1, 1])).tolist())
     if camera.lens_radius == 0:
-        # Of the film's sides; down is positive.
-        x, y = camera.offset[0] / wide, -camera.offset[1] / high
+        x, y = camera.offset[0] / wide, -camera.offset[1] / high  # As parts of the film's sides, y down
         offset = {"principal_point_offset_x": x, "principal_point_offset_y": y} if x or y else {}
         return {"type": "perspective", **offset, **common, **_field_of_view(wide, camera)}
-    # A thin lens has no principal point: the film is a window of a larger one, whose middle is on the axis.
+    # A thin lens has no principal point: the film is a window of a larger one with its middle on the axis.
     sides = zip(size, camera.offset, (wide, high), strict=True)
     halves = [round(2 * pixels * offset / length) for pixels, offset, length in sides]
     full = width + abs(halves[0]), height + abs(halves[1])
@@ -89,7 +86,7 @@ def _sensor(camera: CameraContents, size: tuple[int, int], spp: int | None, note
 
 
 def _film_window(camera: CameraContents, aspect_ratio: float) -> tuple[float, float]:
-    """Width and height of a camera's film, in its units, as its ``conform_policy`` fits the aperture to a picture."""
+    """Width and height of a camera's film in its unit, by the policy that fits its aperture to a picture."""
     wide, of_height = camera.aperture[0], camera.aperture[1] * aspect_ratio
     wide = {
         "expandAperture": max(wide, of_height),
@@ -105,20 +102,16 @@ def _field_of_view(wide: float, camera: CameraContents) -> SceneNode:
 
 
 def size_for(contents: SceneContents, look: Look) -> tuple[int, int]:
-    """Size of the film for a stage: 640 pixels wide and as high as the camera's aperture asks for, if none is given."""
-    if look.size is not None:
-        return look.size
-    if contents.picture.resolution is not None:
-        width, height = contents.picture.resolution
-        return width, height
-    if contents.camera is None:
-        return DEFAULT_SIZE
+    """Size of the film: of the look, of the render settings, or 640 pixels by the aspect ratio of the aperture."""
+    stated = look.size or contents.picture.resolution
+    if stated is not None or contents.camera is None:
+        return stated or DEFAULT_SIZE
     wide, high = contents.camera.aperture
     return WIDTH, max(1, round(WIDTH * high / wide))
 
 
 def angles_for(contents: SceneContents, look: Look) -> View:
-    """View direction of a stage's camera, for the studio, whose lights turn with the camera."""
+    """Azimuth and elevation of a stage's camera, with which the studio's lights turn."""
     if contents.camera is None:
         return look.view
     back = contents.camera.to_world[:3, 2]
@@ -128,14 +121,9 @@ def angles_for(contents: SceneContents, look: Look) -> View:
 
 
 def with_studio_defaults(
-    contents: SceneContents,
-    points: NDArray[np.float64],  # (n, 3) float64: in the world, that the studio is set up around
-    is_lit: bool,  # Whether the stage has lights
-    look: Look,
-    notes: StageWarnings,
-    name: str,  # Of the stage, with which messages begin
+    contents: SceneContents, points: NDArray[np.float64], is_lit: bool, look: Look, notes: StageWarnings, name: str
 ) -> SceneNode:
-    """An integrator, the camera, and what of a studio the stage lacks, as entries of a scene."""
+    """Entries of the integrator and the sensor, and of the studio's parts that the stage lacks, around points."""
     camera, size = contents.camera, size_for(contents, look)
     bounds = np.stack([points.min(axis=0), points.max(axis=0)])
     if (bounds[0] == bounds[1]).all():
@@ -153,7 +141,7 @@ def with_studio_defaults(
     if is_lit:
         return scene
     for name in (name for name in STUDIO if name in entries):
-        # The stage's own camera may be so far away that lights of a studio would be in its picture.
+        # A stage's camera may be so far away that it would see the lights of a studio.
         is_near = camera is not None and entries[name]["type"] == "rectangle"
         scene[name] = _distant_light(entries[name], bounds.mean(axis=0)) if is_near else entries[name]
     if camera is not None:
@@ -162,7 +150,6 @@ def with_studio_defaults(
 
 
 def _distant_light(light: SceneNode, target: NDArray[np.float64]) -> SceneNode:
-    """A distant light with the irradiance of a rectangle light that faces the target."""
     matrix = np.array(light["to_world"].matrix, dtype=np.float64)
     towards = target - matrix[:3, 3]
     distance = np.linalg.norm(towards)

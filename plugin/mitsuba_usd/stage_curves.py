@@ -1,4 +1,4 @@
-"""BasisCurves of a stage as Mitsuba's curves: every basis becomes linear segments or cubic B-splines, exactly."""
+"""BasisCurves of a stage as Mitsuba's curves: linear segments, or exactly converted cubic B-splines."""
 
 from __future__ import annotations
 
@@ -17,35 +17,34 @@ from pxr import Usd, UsdGeom, UsdSkel
 
 from .stage_warnings import StageWarnings
 
-# Coefficients of the powers of a segment's parameter, by its control points.
+# Coefficients of powers of a segment's parameter, from its control points.
 BASES: dict[str, NDArray[np.float64]] = {
     "linear": np.array([[1.0, 0], [-1, 1]]),
     "bezier": np.array([[1.0, 0, 0, 0], [-3, 3, 0, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]),
     "bspline": np.array([[1.0, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6,
     "catmullRom": np.array([[0.0, 2, 0, 0], [-1, 0, 1, 0], [2, -5, 4, -1], [-1, 3, -3, 1]]) / 2,
 }
-# Sine of the largest angle without a gap between tubes, and largest ratio of lengths of even transforms.
+# Sine of the largest angle between tubes without a gap, and largest ratio of lengths of uniform transforms.
 _STRAIGHT, _EVEN = 1e-3, 1.001
-# Parameters along each segment at which colours are sampled.
-_PLACES = (np.arange(8)[:, None] + 0.5) / 8
+_PLACES = (np.arange(8)[:, None] + 0.5) / 8  # Parameters along each segment at which colours are sampled
 
 
 @dataclass(frozen=True, eq=False)
 class CurveTopology:
-    """Segments of curves, and what depends on their points."""
+    """Segments of the curves of a prim."""
 
-    counts: IntArray  # (n,): points of each curve, in the order of the points
+    counts: IntArray  # (n,): number of points of each curve
     basis: str  # One of `BASES`
     wrap: str  # "nonperiodic", "periodic" or "pinned"
 
     @property
     def _steps(self) -> tuple[int, int]:
-        """Points from segment to segment; points beyond each end, where pinned curves reach their own ends by them."""
+        """Points from segment to segment, and added points beyond each end of pinned curves."""
         return (3, 0) if self.basis == "bezier" else (1, int(self.wrap == "pinned" and self.basis != "linear"))
 
     @cached_property
     def segments(self) -> IntArray:
-        """Number of segments of each curve, ``(n,)``: 0 where there are too few points."""
+        """Number of segments of each curve, ``(n,)``; 0 for too few points."""
         step, added = self._steps
         missing = 0 if self.wrap == "periodic" else len(BASES[self.basis]) - step - 2 * added
         return np.maximum((self.counts - missing) // step, 0)
@@ -55,13 +54,12 @@ class CurveTopology:
         return np.repeat(np.arange(len(self.counts)), self.segments)
 
     def has(self, size: int, interpolation: str) -> bool:
-        """Whether there are so many values with an interpolation."""
+        """Whether an interpolation has this number of values."""
         sizes = {"constant": 1, "uniform": len(self.counts), "vertex": self.counts.sum(), "varying": self._ends.sum()}
         return size == sizes.get(interpolation)
 
     @property
     def _ends(self) -> IntArray:
-        """Number of ends of segments of each curve, ``(n,)``."""
         return self.segments + (self.wrap != "periodic")
 
     def powers(self, values: NDArray[np.float64], interpolation: str) -> NDArray[np.float64]:
@@ -78,21 +76,20 @@ class CurveTopology:
         return powers
 
     def _controls(self, values: NDArray[np.float64], index: IntArray) -> NDArray[np.float64]:
-        """Control values of segments, by their indices ``(n_s, 2 or 4)`` within their curves."""
         first, last = ragged.starts(self.counts)[self._curve, None], self.counts[self._curve, None] - 1
         if self.wrap == "periodic":
             return values[first + index % (last + 1)]
         inside = np.clip(index, 0, last)
-        # An added point lies as far beyond an end as the next point lies before it.
+        # Added points mirror the points before an end.
         beyond = values[first + inside] - values[first + np.clip(2 * inside - index, 0, last)]
         return values[first + inside] + (index != inside)[..., None] * beyond
 
     def curve_set(self, points: NDArray[np.float64], radii: NDArray[np.float64], interpolation: str) -> CurveSet:
-        """The curves, with points ``(m, 3)`` and radii ``(k, 1)``."""
+        """Mitsuba's curves with points ``(m, 3)`` and radii ``(k, 1)``."""
         powers = np.concatenate([self.powers(points, "vertex"), self.powers(radii, interpolation)], axis=2)
         is_linear = self.basis == "linear"
         controls = np.linalg.inv(BASES["linear" if is_linear else "bspline"]) @ powers
-        # Segments of a spline share points: each adds its last one to those before.
+        # Segments of a spline share points, and each adds its last point.
         is_spline = is_linear or (self.basis == "bspline" and interpolation != "varying")
         is_new = np.full(controls.shape[:2], not is_spline)
         is_new[:, -1] = is_new[ragged.index_in_row(self.segments) == 0] = True
@@ -112,7 +109,7 @@ class CurveTopology:
 def read_curves(
     prim: Usd.Prim, to_world: NDArray[np.float64], time: Usd.TimeCode, names: Iterable[str], notes: StageWarnings
 ) -> tuple[CageContents, CurveSet]:
-    """Curves; and their points, with primvars of these names along them. Raises ValueError if they are unusable."""
+    """Points of curves with the named primvars, and Mitsuba's curves. Raises ValueError for unusable ones."""
     curves, primvars = UsdGeom.BasisCurves(prim), UsdGeom.PrimvarsAPI(prim)
     kind, basis, wrap = (str(value_at(prim.GetAttribute(name), time)) for name in ("type", "basis", "wrap"))
     points = _numbers(value_at(curves.GetPointsAttr(), time))
@@ -130,14 +127,14 @@ def read_curves(
     if not topology.has(len(widths), of_widths) or not (widths >= 0).all():
         raise ValueError(f"there are {len(widths)} {of_widths} widths; expected one for each, 0 or more")
     sizes = np.linalg.svd(to_world[:3, :3], compute_uv=False)
-    told = {
+    problems = {
         "curves with too few points are left out": not topology.segments.all(),
         "normals of curves are ignored; Mitsuba's curves are tubes": value_at(curves.GetNormalsAttr(), time),
         "skeletons of curves are ignored": prim.HasAPI(UsdSkel.BindingAPI),
         "cubic curves with corners have gaps there, as Mitsuba's tubes have no caps": topology.has_corners(points),
         "curves stay round where transforms stretch them": sizes[0] > _EVEN * sizes[2],
     }
-    for what in (what for what, is_so in told.items() if is_so):
+    for what in (what for what, is_so in problems.items() if is_so):
         notes.add(what, prim.GetPath())
     attributes = {}
     for primvar in filter(UsdGeom.Primvar.HasValue, map(primvars.GetPrimvar, names)):

@@ -1,4 +1,4 @@
-"""Lights of UsdLux and cameras as plain data."""
+"""Lights of UsdLux, and cameras, as plain data."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .contents import CameraContents, LightContents
 from .stage_settings import namespaced
 from .stage_warnings import StageWarnings
 
-# Kind of each type, and attributes for its sizes. The schemas of lights say what they are without a value.
+# Kind of each type of light, and attributes of its size.
 _KINDS: dict[str, tuple[str, ...]] = {
     "DistantLight": ("distant", "inputs:angle"),
     "RectLight": ("rect", "inputs:width", "inputs:height"),
@@ -23,10 +23,10 @@ _KINDS: dict[str, tuple[str, ...]] = {
     "DomeLight": ("dome",),
     "DomeLight_1": ("dome",),
 }
-# Angle in degrees, of the Sun and some more, up to which a distant light becomes a point without a warning.
+# Largest angle in degrees, of the Sun and some more, of a distant light that becomes a point without a warning.
 _POINTLIKE = 1.0
 _CONE = "inputs:shaping:cone:angle"
-# Attributes of lights that are ignored, the values that have no effect, and why.
+# Ignored attributes of lights, their values without effect, and the reason.
 _EVERYWHERE = "Mitsuba's area lights shine in all directions"
 _NEUTRAL_OF_LIGHTS = {
     "inputs:diffuse": (1, "lights illuminate all materials"),
@@ -38,14 +38,13 @@ _NEUTRAL_OF_LIGHTS = {
 }
 _NEUTRAL_EXPOSURE = {"exposure": 0.0, "exposure:iso": 100.0}
 _NEUTRAL_EXPOSURE |= dict.fromkeys(("exposure:time", "exposure:fStop", "exposure:responsivity"), 1.0)
-# Apertures and focal lengths are in tenths of the world's unit.
-_TENTHS = 0.1
+_TENTHS = 0.1  # Apertures and focal lengths are in tenths of the world's unit
 
 
 def read_light(
     prim: Usd.Prim, to_world: NDArray[np.float64], time: Usd.TimeCode, notes: StageWarnings
 ) -> LightContents | None:
-    """Read a light with a transform ``(4, 4)`` for column vectors; None if its kind is not supported."""
+    """Read a light with a transform ``(4, 4)`` for column vectors; return None for unsupported or dark ones."""
     path, given = prim.GetPath(), str(prim.GetTypeName())
     if given not in _KINDS:
         notes.add(f"lights of type {given} are ignored; expected one of {', '.join(_KINDS)}", path)
@@ -71,21 +70,12 @@ def read_light(
     pole = _value(prim, "poleAxis", time, "scene") if given == "DomeLight_1" else "Y"
     if pole == "scene":
         pole = UsdGeom.GetStageUpAxis(prim.GetStage())
-    light = LightContents(
-        str(path),
-        kind,
-        to_world,
-        read_emission(prim, time).tolist(),
-        is_normalized,
-        size,
-        _texture(prim, time, notes) if kind in ("rect", "dome") else None,
-        str(pole).lower(),
-    )
-    numbers = np.array([*light.emission, *light.size, *to_world.ravel()])
-    is_area = light.kind not in ("distant", "dome", "point", "spot")
-    if not np.isfinite(numbers).all() or np.linalg.det(to_world[:3, :3]) == 0 or (is_area and min(light.size) <= 0):
+    emission = read_emission(prim, time).tolist()
+    numbers, is_area = [*emission, *size, *to_world.ravel()], kind not in ("distant", "dome", "point", "spot")
+    if not np.isfinite(numbers).all() or np.linalg.det(to_world[:3, :3]) == 0 or (is_area and min(size) <= 0):
         raise ValueError("the light is not usable; expected finite numbers, a size above 0 and an invertible transform")
-    return light
+    texture = _texture(prim, time, notes) if kind in ("rect", "dome") else None
+    return LightContents(str(path), kind, to_world, emission, is_normalized, size, texture, str(pole).lower())
 
 
 def read_emission(prim: Usd.Prim, time: Usd.TimeCode) -> NDArray[np.float64]:
@@ -111,8 +101,7 @@ def _note_ignored(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> N
         if value != neutral and not is_cone_kept:
             notes.add(f"{name} of lights is ignored; {reason}", prim.GetPath())
     for name, what in (("light:filters", "light filters"), ("portals", "portals")):
-        relationship = prim.GetRelationship(name)
-        if relationship and relationship.GetTargets():
+        if (relationship := prim.GetRelationship(name)) and relationship.GetTargets():
             notes.add(f"{what} are ignored", prim.GetPath())
     for link in ("lightLink", "shadowLink"):
         root = prim.GetAttribute(f"collection:{link}:includeRoot")
@@ -133,13 +122,10 @@ def _texture(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> str | 
 
 
 def read_camera(
-    camera: UsdGeom.Camera,
-    # (4, 4) float64: for column vectors. Scales are left out, as USD's own frustum of a camera has none.
-    to_world: NDArray[np.float64],
-    time: Usd.TimeCode,
-    notes: StageWarnings,
+    camera: UsdGeom.Camera, to_world: NDArray[np.float64], time: Usd.TimeCode, notes: StageWarnings
 ) -> CameraContents:
-    """Read a camera. Raises TypeError, ValueError if it has no image."""
+    """Read a camera with a transform ``(4, 4)`` for column vectors. Raises TypeError, ValueError if it is unusable."""
+    # Frustums of USD have no scale.
     prim, path = camera.GetPrim(), camera.GetPath()
     x, y, z = to_world[:3, :3].T
     forward = -z / np.linalg.norm(z)
@@ -165,7 +151,7 @@ def read_camera(
     near, far = value_at(camera.GetClippingRangeAttr(), time)
     if not near <= far:
         notes.add("a clippingRange of cameras that is not from a number to a larger one is ignored", path)
-        near, far = 1.0, 1e6  # As the schema has them
+        near, far = 1.0, 1e6  # Defaults of the schema
     focal_length, f_stop, focus = number("focalLength"), number("fStop"), number("focusDistance")
     has_lens = is_perspective and f_stop > 0 and focus > 0
     if is_perspective and f_stop > 0 >= focus:
@@ -177,10 +163,8 @@ def read_camera(
         notes.add("clippingPlanes of cameras are ignored", path)
     lens = (_TENTHS * focal_length / (2 * f_stop), focus) if has_lens else (0.0, 0.0)
     numbers = focal_length, float(near), float(far), *lens
-    if (
-        not np.isfinite([*to_world.ravel(), *film[0], *film[1], *numbers, *shutter]).all()
-        or min(*film[0], numbers[0]) <= 0
-    ):
+    is_finite = np.isfinite([*to_world.ravel(), *film[0], *film[1], *numbers, *shutter]).all()
+    if not is_finite or min(*film[0], focal_length) <= 0:
         raise ValueError("the camera has no image")
     stated = namespaced(prim, "mitsuba:sensor", time)
     return CameraContents(str(path), rigid, is_perspective, *film, *numbers, shutter, mitsuba=stated)

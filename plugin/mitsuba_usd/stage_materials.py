@@ -1,10 +1,10 @@
-"""Materials of a stage as plain data: shading networks of USD, MaterialX and Mitsuba, as expressions."""
+"""Materials of a stage as plain data: shading networks of USD, MaterialX and Mitsuba as expressions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mitsuba_subdivision.cage import same
@@ -24,18 +24,10 @@ if TYPE_CHECKING:
     import MaterialX
 
 
-class _Port(NamedTuple):
-    name: str
-    # Type of MaterialX. Of USD's nodes "asset", "texcoord", "string", or "" for numbers; "constant" for numbers that
-    # cannot be connected to shaders.
-    kind: str
-    default: Input | None = None  # None for a vector of the surface
-
-    @property
-    def width(self) -> int:
-        """How many numbers it has; 0 if that is not known."""
-        default = None if isinstance(self.default, str) else self.default
-        return nodes.CHANNELS.get(self.kind, 0 if default is None else nodes.width_of(default))
+# Type and default of each input of a node; the default of a geometric input is None. Types are those of MaterialX, and
+# for USD's nodes "asset", "texcoord", "string", "" for numbers, and "constant" for numbers without connections.
+_Ports = dict[str, tuple[str, Input | None]]
+_Inputs = dict[str, Input | None]
 
 
 def _texcoords(name: str, fallback: Input | None = None) -> NodeContents:
@@ -43,24 +35,22 @@ def _texcoords(name: str, fallback: Input | None = None) -> NodeContents:
 
 
 _PREVIEW_SURFACE = "UsdPreviewSurface"
-# Before the name of a plugin of Mitsuba, in the identifier of a node.
-_PLUGIN = "mitsuba_"
-# Renderers whose outputs of a material are read, the preferred first; "" for any renderer.
+_PLUGIN = "mitsuba_"  # Prefix of the identifiers of Mitsuba's plugins
+# Render contexts of the outputs of a material, the preferred first; "" is the universal one.
 _CONTEXTS = ("mitsuba", "mtlx", "")
-_PREVIEW_PORTS = [_Port(name, "string" if name == "opacityMode" else "", value) for name, value in PREVIEW.items()]
-_PREVIEW_PORTS += [_Port("normal", ""), _Port("occlusion", ""), _Port("displacement", "", 0.0)]
-_TEXTURE_PORTS = [
-    _Port("file", "asset"), _Port("st", "texcoord", _texcoords("st")), _Port("sourceColorSpace", "string", "auto"),
-    _Port("wrapS", "string", "useMetadata"), _Port("wrapT", "string", "useMetadata"),
-    _Port("scale", "constant", [1.0] * 4), _Port("bias", "constant", [0.0] * 4),
-    _Port("fallback", "constant", [0.0, 0.0, 0.0, 1.0]),
-]  # fmt: skip
-_TRANSFORM_PORTS = [
-    _Port("in", "texcoord", _texcoords("st")), _Port("rotation", "constant", 0.0),
-    _Port("scale", "constant", [1.0, 1.0]), _Port("translation", "constant", [0.0, 0.0]),
-]  # fmt: skip
-_DISPLACEMENT_PORTS = [_Port("displacement", "float", 0.0), _Port("scale", "float", 1.0)]
-# Of readers of primvars, by the ends of their names; others read numbers.
+_PREVIEW_PORTS: _Ports = {name: ("string" if name == "opacityMode" else "", value) for name, value in PREVIEW.items()}
+_PREVIEW_PORTS |= {"normal": ("", None), "occlusion": ("", None), "displacement": ("", 0.0)}
+_TEXTURE_PORTS: _Ports = {
+    "file": ("asset", None), "st": ("texcoord", _texcoords("st")), "sourceColorSpace": ("string", "auto"),
+    "wrapS": ("string", "useMetadata"), "wrapT": ("string", "useMetadata"),
+    "scale": ("constant", [1.0] * 4), "bias": ("constant", [0.0] * 4), "fallback": ("constant", [0.0, 0.0, 0.0, 1.0]),
+}  # fmt: skip
+_TRANSFORM_PORTS: _Ports = {
+    "in": ("texcoord", _texcoords("st")), "rotation": ("constant", 0.0),
+    "scale": ("constant", [1.0, 1.0]), "translation": ("constant", [0.0, 0.0]),
+}  # fmt: skip
+_DISPLACEMENT_PORTS: _Ports = {"displacement": ("float", 0.0), "scale": ("float", 1.0)}
+# Channels of UsdPrimvarReaders, by the ends of their names; others have one.
 _PRIMVAR_WIDTHS = {"float2": 2, "float3": 3, "float4": 4, "point": 3, "normal": 3, "vector": 3}
 _TEXTURE_OUTPUTS = ("rgb", "r", "g", "b", "a")
 _COLOR_SPACES = ("auto", "raw", "sRGB")
@@ -75,41 +65,37 @@ _IS_SRGB = {
     "srgb_texture": True, "sRGB": True, "g22_rec709": True, "rec709_display": True,
     "": False, "lin_rec709": False, "raw": False, "Raw": False, "none": False, "data": False, "lin_srgb": False,
 }  # fmt: skip
-# Nodes of an expression, shared ones counted for each use; and shaders that lead to each other in a row.
+# Most nodes of an expression, shared ones counted for each use; and most shaders in a row.
 _MOST_NODES, _DEEPEST = 10_000, 60
 
 
 def _path_of(asset: Any, attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
-    """Path of the file that is the value of an attribute; "" for none."""
     if asset.resolvedPath or UDIM not in asset.path:
         return str(asset.resolvedPath or asset.path)
-    # No file has this name, so USD leaves it as it is. It is relative to the layer that says so.
+    # USD does not resolve <UDIM>; the path is relative to the layer of the opinion.
     layer = attribute.GetPropertyStack(time)[0].layer
     return UsdShade.UdimUtils.ResolveUdimPath(asset.path, layer) or asset.path
 
 
 class MaterialReader:
-    """Reads materials, each once: shading networks of USD, MaterialX and Mitsuba."""
+    """Reader of the materials of a stage, each once."""
 
     def __init__(self, time: Usd.TimeCode, notes: StageWarnings) -> None:
         self._time, self._notes = time, notes
         self._materials: dict[str, MaterialContents | None] = {}
-        # Outputs of shaders, by path and name, and numbers of nodes by the identity of the expression.
+        # Expressions by path and output of their shader, and their numbers of nodes by their identity.
         self._known: dict[tuple[str, str], Input | None] = {}
         self._sizes: dict[int, int] = {}
         self._depth = 0
 
     def bound(self, prim: Usd.Prim) -> MaterialContents | None:
-        """The material bound to a prim; None if there is none or it is not supported."""
-        for purpose in (UsdShade.Tokens.full, UsdShade.Tokens.preview):
-            material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial(purpose)[0]
-            contents = self._material(material) if material else None
-            if contents is not None:
-                return contents
-        return None
+        """The material bound to a prim; None without a supported one."""
+        bindings, purposes = UsdShade.MaterialBindingAPI(prim), (UsdShade.Tokens.full, UsdShade.Tokens.preview)
+        found = (material for purpose in purposes if (material := bindings.ComputeBoundMaterial(purpose)[0]))
+        return next((contents for contents in map(self._material, found) if contents is not None), None)
 
     def _material(self, material: UsdShade.Material) -> MaterialContents | None:
-        """A material, or an equal one with another name; None if it is not supported."""
+        """The contents of a material, the same for equal materials; None if it is not supported."""
         path = str(material.GetPath())
         if path not in self._materials:
             try:
@@ -142,19 +128,17 @@ class MaterialReader:
         heights = self._displacement(material)
         if model == _PLUGIN:
             return MaterialContents(str(path), {**inputs, **heights})
-        names = [name for name in LEFT_OUT[model] if not nodes.is_all(inputs.get(name, 0.0), 0)]
-        if names:
+        if names := [name for name in LEFT_OUT[model] if not nodes.is_all(inputs.get(name, 0.0), 0)]:
             self._notes.add(f"inputs of {model} that Mitsuba's BSDFs lack are ignored", f"{', '.join(names)} of {path}")
         if any(inputs.get(name, 0.0) != 0 for name in ("subsurface", "subsurface_weight")):
             self._notes.add("subsurface scattering is rendered as diffuse reflection of its colour", path)
         contents = surface_models.material(str(path), model, inputs)
         if not heights and not nodes.is_all(inputs.get("displacement", 0.0), 0):
-            what = f"displacement of {model} is ignored where the material has no connected outputs:displacement"
-            self._notes.add(what, path)
+            what = "is ignored where the material has no connected outputs:displacement"
+            self._notes.add(f"displacement of {model} {what}", path)
         return replace(contents, inputs={**contents.inputs, **heights})
 
     def _displacement(self, material: UsdShade.Material) -> dict[str, Input]:
-        """Heights along the normal, and their scale, where a material has a displacement."""
         contexts = _contexts(material.GetDisplacementOutputs())
         context = next((name for name in _CONTEXTS if name in contexts), "")
         shader, output, _ = material.ComputeDisplacementSource(context)
@@ -162,18 +146,18 @@ class MaterialReader:
             return {}
         scale: Input | None = 1.0
         if shader.GetShaderId() == _PREVIEW_SURFACE:
-            heights = self._input(shader, _Port("displacement", "", 0.0))
+            heights = self._input(shader, "displacement", "", 0.0)
         elif shader.GetShaderId() == "ND_displacement_float":
             heights, scale = self._inputs(shader, _DISPLACEMENT_PORTS).values()
         else:
             heights = self._output(shader, output)
         heights, scale = 0.0 if heights is None else heights, 1.0 if scale is None else scale
-        if not isinstance(heights, PrimvarContents):
-            return {"displacement": surface_models.number("multiply", heights, scale)}
-        return {"displacement": heights, "displacement_scale": float(nodes.constant(scale)[0])}
+        if isinstance(heights, PrimvarContents):
+            return {"displacement": heights, "displacement_scale": float(nodes.constant(scale)[0])}
+        return {"displacement": surface_models.number("multiply", heights, scale)}
 
     def _surface(self, shader: UsdShade.Shader) -> tuple[str, dict[str, Input]] | None:
-        """Model of a surface, and all its inputs except geometric ones; None if it is of no known model."""
+        """Model of a surface shader, and all its inputs except geometric ones; None if the model is unknown."""
         name = shader.GetShaderId() or ""
         if name.startswith(_PLUGIN):
             return _PLUGIN, {"bsdf": self._plugin(shader)}
@@ -191,81 +175,69 @@ class MaterialReader:
         inputs = {key: value for key, value in self._inputs(shader, ports).items() if value is not None}
         return (model, inputs) if model in MODELS else None
 
-    def _ports(self, definition: MaterialX.NodeDef) -> list[_Port]:
-        return [_Port(d.getName(), d.getType(), self._default(d)) for d in definition.getActiveInputs()]
+    def _ports(self, definition: MaterialX.NodeDef) -> _Ports:
+        return {d.getName(): (d.getType(), _default(d)) for d in definition.getActiveInputs()}
 
-    def _inputs(self, shader: UsdShade.Shader, ports: list[_Port]) -> dict[str, Input | None]:
-        names = sorted({given.GetBaseName() for given in shader.GetInputs()} - {port.name for port in ports})
-        if names:
+    def _inputs(self, shader: UsdShade.Shader, ports: _Ports) -> _Inputs:
+        if names := sorted({given.GetBaseName() for given in shader.GetInputs()} - ports.keys()):
             what = f"inputs that {shader.GetShaderId()} does not have are ignored"
             self._notes.add(what, f"{', '.join(names)} of {shader.GetPath()}")
-        return {port.name: self._input(shader, port) for port in ports}
+        return {name: self._input(shader, name, kind, default) for name, (kind, default) in ports.items()}
 
-    def _input(self, shader: UsdShade.Shader, port: _Port) -> Input | None:
-        """An input of a shader; None for a vector of the surface. Raises MaterialError if it has another type."""
-        given = shader.GetInput(port.name)
+    def _input(self, shader: UsdShade.Shader, name: str, kind: str, default: Input | None = None) -> Input | None:
+        """An input of a shader; None for a geometric one. Raises MaterialError if it has another type."""
+        given = shader.GetInput(name)
         attribute = next(iter(given.GetValueProducingAttributes() if given else ()), None)
         if attribute is None:
             stage = shader.GetPrim().GetStage()
             if given and not all(stage.GetPropertyAtPath(path) for path in given.GetAttr().GetConnections()):
-                what = "connections of inputs to missing attributes are ignored"
-                self._notes.add(what, given.GetAttr().GetPath())
-            if port.kind == "texcoord":
-                what = f"textures read the texture coordinates st where {port.name} is not connected"
+                self._notes.add("connections of inputs to missing attributes are ignored", given.GetAttr().GetPath())
+            if kind == "texcoord":
+                what = f"textures read the texture coordinates st where {name} is not connected"
                 self._notes.add(what, shader.GetPath())
-            return port.default
+            return default
         if not UsdShade.Output.IsOutput(attribute):
-            return self._value(attribute, port)
-        if port.kind in ("constant", "string"):
-            what = f"connections of {port.name} of {shader.GetShaderId()} to shaders are ignored"
+            return self._value(attribute, kind, default)
+        if kind in ("constant", "string"):
+            what = f"connections of {name} of {shader.GetShaderId()} to shaders are ignored"
             self._notes.add(what, shader.GetPath())
-            return port.default
+            return default
         made = self._output(UsdShade.Shader(attribute.GetPrim()), attribute.GetBaseName())
-        if made is not None and port.kind in nodes.CHANNELS:
-            _require_width(nodes.width_of(made), port, given.GetAttr())
-        return port.default if made is None else made
+        if made is not None and kind in nodes.CHANNELS:
+            _require_width(nodes.width_of(made), kind, default, given.GetAttr())
+        return default if made is None else made
 
-    def _value(self, attribute: Usd.Attribute, port: _Port) -> Input | None:
-        value, is_file = value_at(attribute, self._time), port.kind in ("filename", "asset")
+    def _value(self, attribute: Usd.Attribute, kind: str, default: Input | None) -> Input | None:
+        value, is_file = value_at(attribute, self._time), kind in ("filename", "asset")
         if value is None:
-            return port.default
+            return default
         if is_file != isinstance(value, Sdf.AssetPath):
             raise MaterialError(f"{attribute.GetPath()} is {'no' if is_file else 'a'} file")
         if is_file:
-            # A picture of four channels that is everywhere.
-            path, is_raw = _path_of(value, attribute, self._time), not self._is_srgb(port, attribute)
+            path, is_raw = _path_of(value, attribute, self._time), not self._is_srgb(kind, attribute)
             return TextureContents(path, "rgba", "raw" if is_raw else "sRGB")
-        if isinstance(value, str) or port.kind == "string":
-            return str(value) if port.kind == "string" else port.default
+        if isinstance(value, str) or kind == "string":
+            return str(value) if kind == "string" else default
         numbers = np.asarray(value)
         is_finite = numbers.dtype.kind in "biuf" and np.isfinite(numbers).all()
-        _require_width(numbers.size if is_finite else 0, port, attribute)
-        numbers = decoded(numbers.astype(np.float64)) if self._is_srgb(port, attribute) else numbers.astype(np.float64)
+        _require_width(numbers.size if is_finite else 0, kind, default, attribute)
+        numbers = decoded(numbers.astype(np.float64)) if self._is_srgb(kind, attribute) else numbers.astype(np.float64)
         return numbers.ravel().tolist() if numbers.ndim else float(numbers)
 
-    def _is_srgb(self, port: _Port, attribute: Usd.Attribute) -> bool:
-        """Whether an attribute says that its colours are encoded."""
-        space = attribute.GetColorSpace() if port.kind in ("filename", "color3", "color4") else ""
+    def _is_srgb(self, kind: str, attribute: Usd.Attribute) -> bool:
+        space = attribute.GetColorSpace() if kind in ("filename", "color3", "color4") else ""
         if space not in _IS_SRGB:
             what = f'the colour space "{space}" is ignored; colours are read as linear Rec. 709'
             self._notes.add(what, attribute.GetPath())
         return _IS_SRGB.get(space, False)
 
-    def _default(self, declared: MaterialX.Input) -> Input | None:
-        geometry = declared.getDefaultGeomPropString()
-        if geometry:
-            return _texcoords("st") if geometry == "UV0" else None
-        text = declared.getValueString()
-        return numbers(text, declared.getType()) if text or declared.getType() in ("string", "filename") else None
-
     def _output(self, shader: UsdShade.Shader, output: str) -> Input | None:
-        """What a shader computes, read once; None if that is unknown."""
+        """Expression of a shader's output, read once; None if the shader is unknown."""
         key = str(shader.GetPath()), output
         if key not in self._known:
             if self._depth > _DEEPEST:
                 raise MaterialError(f"more than {_DEEPEST} shaders in a row")
-            # A network that leads to itself has no value.
-            self._known[key] = 0.0
+            self._known[key] = 0.0  # The value of a cycle
             self._depth += 1
             try:
                 self._known[key] = self._computed(shader, output)
@@ -289,8 +261,7 @@ class MaterialReader:
         if name.startswith("UsdPrimvarReader"):
             width = _PRIMVAR_WIDTHS.get(name.rpartition("_")[2], 1)
             zero: Input = 0.0 if width == 1 else [0.0] * width
-            ports = [_Port("varname", "string", ""), _Port("fallback", "constant", zero)]
-            read: dict[str, Any] = self._inputs(shader, ports)
+            read: dict[str, Any] = self._inputs(shader, {"varname": ("string", ""), "fallback": ("constant", zero)})
             if width == 2:
                 return _texcoords(read["varname"] or "st", read["fallback"])
             return PrimvarContents(read["varname"], nodes.constant(read["fallback"], width).tolist())
@@ -305,14 +276,13 @@ class MaterialReader:
         return self._made(definition, output, self._inputs(shader, self._ports(definition)), path)
 
     def _plugin(self, shader: UsdShade.Shader) -> TextureContents | NodeContents:
-        """A plugin of Mitsuba with its parameters; of bitmaps, the picture."""
         name, path = shader.GetShaderId().removeprefix(_PLUGIN), shader.GetPath()
         parameters: dict[str, Input] = {}
         for given in shader.GetInputs():
             key, attribute = given.GetBaseName(), next(iter(given.GetValueProducingAttributes()), None)
             value: Any = None if attribute is None else value_at(attribute, self._time)
             if attribute is None or UsdShade.Output.IsOutput(attribute):
-                value = self._input(shader, _Port(key, ""))
+                value = self._input(shader, key, "")
             elif isinstance(value, Sdf.AssetPath):
                 value = _path_of(value, attribute, self._time)
             elif not isinstance(value, (bool, int, float, str)):
@@ -320,14 +290,14 @@ class MaterialReader:
                 value = (numbers.T[:3, :3] if numbers.ndim == 2 else numbers).ravel().tolist()
             parameters |= {} if value is None else {key: value}
         if name not in ("bitmap", "checkerboard"):
-            return NodeContents(name, "mitsuba", parameters)
+            return NodeContents(name, nodes.PLUGIN, parameters)
         matrix: Any = parameters.pop("to_uv", np.eye(3).ravel().tolist())
         if np.size(matrix) != 9:
             raise MaterialError(f"to_uv of {path} is no matrix")
         to_uv = np.reshape(matrix, (3, 3)) @ V_DOWN
         if name == "checkerboard":
             placed: dict[str, Input] = {"to_uv": to_uv.ravel().tolist(), "": _texcoords("st")}
-            return NodeContents(name, "mitsuba", {**parameters, **placed})
+            return NodeContents(name, nodes.PLUGIN, {**parameters, **placed})
         file, wrap = (str(parameters.pop(key, usual)) for key, usual in (("filename", ""), ("wrap_mode", "repeat")))
         space = "raw" if parameters.pop("raw", False) else "auto"
         if parameters:
@@ -338,15 +308,15 @@ class MaterialReader:
         path = shader.GetPath()
         given: dict[str, Any] = self._inputs(shader, _TEXTURE_PORTS)
         if output not in _TEXTURE_OUTPUTS:
-            self._notes.add(f'the output "{output}" of textures is not there; rgb is used', path)
+            self._notes.add(f'the output "{output}" of textures is unknown; rgb is used', path)
             output = "rgb"
         file, space = given["file"], given["sourceColorSpace"]
         if not isinstance(file, TextureContents) or not file.file:
             self._notes.add("textures without a file are ignored", path)
             return None
         if space not in _COLOR_SPACES:
-            expected = ", ".join(_COLOR_SPACES)
-            self._notes.add(f'sourceColorSpace "{space}" of textures is ignored; expected {expected}', path)
+            what = f'sourceColorSpace "{space}" of textures is ignored; expected {", ".join(_COLOR_SPACES)}'
+            self._notes.add(what, path)
             space = "auto"
         numbers = {name: given[name] for name in ("scale", "bias", "fallback")}
         wrap = self._wrap(given, ("wrapS", "wrapT"), path)
@@ -354,7 +324,6 @@ class MaterialReader:
         return self._placed(picture, "color3" if output == "rgb" else "float", given["st"])
 
     def _wrap(self, given: dict[str, Any], names: tuple[str, str], prim: object) -> str:
-        """Mitsuba's name of how a picture continues, by its inputs along u and v."""
         modes = []
         for name in names:
             mode = str(given.get(name))
@@ -367,10 +336,7 @@ class MaterialReader:
             self._notes.add(f"{names[1]} of textures is ignored; {names[0]} applies to both coordinates", prim)
         return modes[0]
 
-    def _made(
-        self, definition: MaterialX.NodeDef, output: str, inputs: dict[str, Input | None], prim: object
-    ) -> Input | None:
-        """What a node computes of its inputs: an expression of primitive nodes."""
+    def _made(self, definition: MaterialX.NodeDef, output: str, inputs: _Inputs, prim: object) -> Input | None:
         import MaterialX
 
         category = definition.getNodeString()
@@ -397,7 +363,6 @@ class MaterialReader:
             what = f'MaterialX nodes "{category}" are ignored; their first input is used instead, or 0'
             self._notes.add(what, prim)
             return next((value for name, value in there.items() if name.startswith("in")), 0.0)
-        # Nodes of inputs, counted as often as they are read.
         size = sum(self._sizes.get(id(value), 1) for value in there.values() if not nodes.is_constant(value))
         if size > _MOST_NODES:
             self._notes.add(f"networks of more than {_MOST_NODES} nodes are ignored; 0 is used instead", prim)
@@ -406,9 +371,7 @@ class MaterialReader:
         self._sizes[id(made)] = 1 + size
         return made
 
-    def _expanded(
-        self, graph: MaterialX.NodeGraph, output: str, given: dict[str, Input | None], prim: object
-    ) -> Input | None:
+    def _expanded(self, graph: MaterialX.NodeGraph, output: str, given: _Inputs, prim: object) -> Input | None:
         made: dict[tuple[str, str], Input | None] = {}
 
         def of_port(port: Any) -> Input | None:
@@ -422,17 +385,15 @@ class MaterialReader:
                 inner = graph.getNode(name)
                 definition = inner.getNodeDef("", True)
                 inputs = {
-                    declared.name: declared.default
-                    if (inside := inner.getInput(declared.name)) is None
-                    else of_port(inside)
-                    for declared in self._ports(definition)
+                    declared: default if (inside := inner.getInput(declared)) is None else of_port(inside)
+                    for declared, (_, default) in self._ports(definition).items()
                 }
                 made[key] = self._made(definition, key[1] or "out", inputs, prim)
             return made[key]
 
         return of_port(graph.getOutput(output) or graph.getOutputs()[0])
 
-    def _image(self, kind: str, given: dict[str, Input | None], prim: object) -> Input:
+    def _image(self, kind: str, given: _Inputs, prim: object) -> Input:
         file, fallback, width = given["file"], given.get("default"), nodes.CHANNELS[kind]
         usual = np.zeros(4)
         if isinstance(fallback, (int, float, list)):
@@ -450,7 +411,7 @@ class MaterialReader:
         return self._placed(picture, kind, given["texcoord"])
 
     def _placed(self, picture: TextureContents, kind: str, where: Input | None) -> Input:
-        """A picture at texture coordinates; a node of a type if these are no affine function of those of the mesh."""
+        """The image at texture coordinates, or a node "image" if these are not affine in those of the mesh."""
         if isinstance(where, PrimvarContents):
             return replace(picture, texcoords=_texcoords(where.name, where.fallback[:2]))
         where = [0.0, 0.0] if where is None else where
@@ -460,8 +421,7 @@ class MaterialReader:
             return NodeContents("image", kind, {"file": picture, "texcoord": where})
         return replace(picture, to_uv=to_uv, texcoords=sets[0] if sets else picture.texcoords)
 
-    def _attribute(self, kind: str, given: dict[str, Input | None], prim: object) -> Input:
-        """An attribute of the mesh; texture coordinates if it has two components."""
+    def _primvar(self, kind: str, given: _Inputs, prim: object) -> Input:
         name, fallback = str(given["geomprop"]), given.get("default")
         if kind == "vector2":
             if fallback is not None and not nodes.is_constant(fallback):
@@ -470,7 +430,7 @@ class MaterialReader:
         usual = fallback if isinstance(fallback, (int, float, list)) else 0.0
         return PrimvarContents(name, nodes.constant(usual, nodes.CHANNELS.get(kind, 1)).tolist())
 
-    def _normal(self, _kind: str, given: dict[str, Input | None], _prim: object) -> Input | None:
+    def _normal(self, _kind: str, given: _Inputs, _prim: object) -> Input | None:
         """A normal map in tangent space, from -1 to 1."""
         picture, scale = given["in"], given["scale"]
         if picture is None or scale is None or nodes.is_constant(picture):
@@ -483,21 +443,27 @@ class MaterialReader:
         return replace(turned, fallback=[0.0, 0.0, 1.0, 1.0]) if isinstance(turned, TextureContents) else turned
 
 
-# Reads a node of MaterialX of a type, with its inputs, at a prim.
-_Reading = Callable[[MaterialReader, str, dict[str, Input | None], object], Input | None]
-_SPECIAL: dict[str, _Reading] = {
+# Readers of nodes by category, from the type of the output, the inputs and the prim.
+_SPECIAL: dict[str, Callable[[MaterialReader, str, _Inputs, object], Input | None]] = {
     "image": MaterialReader._image,
-    "geompropvalue": MaterialReader._attribute,
-    "geompropvalueuniform": MaterialReader._attribute,
+    "geompropvalue": MaterialReader._primvar,
+    "geompropvalueuniform": MaterialReader._primvar,
     "normalmap": MaterialReader._normal,
 }
 
 
+def _default(declared: MaterialX.Input) -> Input | None:
+    if geometry := declared.getDefaultGeomPropString():
+        return _texcoords("st") if geometry == "UV0" else None
+    text, kind = declared.getValueString(), declared.getType()
+    return numbers(text, kind) if text or kind in ("string", "filename") else None
+
+
 def _contexts(outputs: list[UsdShade.Output]) -> list[str]:
-    """Renderers that connected outputs are for; "" for any."""
     return [output.GetBaseName().rpartition(":")[0] for output in outputs if output.HasConnectedSource()]
 
 
-def _require_width(width: int, port: _Port, attribute: Usd.Attribute) -> None:
-    if not width or (port.width and width != port.width and (width > 1 or port.kind == "constant")):
-        raise MaterialError(f"{attribute.GetPath()}; expected {port.width or 'some'} finite numbers")
+def _require_width(width: int, kind: str, default: Input | None, attribute: Usd.Attribute) -> None:
+    expected = nodes.CHANNELS.get(kind, 0 if default is None or isinstance(default, str) else nodes.width_of(default))
+    if not width or (expected and width != expected and (width > 1 or kind == "constant")):
+        raise MaterialError(f"{attribute.GetPath()}; expected {expected or 'some'} finite numbers")

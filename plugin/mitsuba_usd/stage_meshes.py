@@ -22,12 +22,9 @@ from .stage_lights_and_camera import read_emission
 from .stage_materials import MaterialReader
 from .stage_warnings import StageWarnings
 
-# Primvars that are the colour of meshes without a material.
-COLORS = ("displayColor", "displayOpacity")
-# Faces times parts of a mesh, up to which each part evaluates the whole surface.
-MOST_SHARED_FACES = 1_000_000
-# Segments of a circle around the axis, and of half a circle along it.
-AROUND, ALONG = 64, 24
+COLORS = ("displayColor", "displayOpacity")  # Primvars for the colour of meshes without a material
+MOST_SHARED_FACES = 1_000_000  # Most faces times parts of a mesh whose parts each evaluate the whole surface
+AROUND, ALONG = 64, 24  # Segments of spheres and the like: of a circle around the axis, and of half a circle along it
 # Even permutations of the coordinates that take z to an axis.
 _TURNS = {"X": (2, 0, 1), "Y": (1, 2, 0), "Z": (0, 1, 2)}
 _NO_FACES: IntArray = np.zeros(0, np.int64)
@@ -36,15 +33,16 @@ Line = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 class ShapeReader:
-    """Reads meshes, and the shapes that USD has without meshes; messages begin with the name."""
+    """Reader of meshes, curves and solids; messages begin with the name."""
 
     def __init__(self, name: str, time: Usd.TimeCode, materials: MaterialReader, notes: StageWarnings) -> None:
         self._name, self._time, self._materials, self._notes = name, time, materials, notes
         self._skinning = Skinning(time, notes.add)
 
     def read(self, prim: Usd.Prim, to_world: NDArray[np.float64]) -> list[ShapeContents]:
-        """Shapes of a prim with a transform ``(4, 4)`` for column vectors: one for each material."""
-        location = f"{self._name}, prim {shortened(str(prim.GetPath()))}"
+        """Shapes of a prim with a transform ``(4, 4)`` for column vectors, one for each material."""
+        path = str(prim.GetPath())
+        location = f"{self._name}, prim {shortened(path)}"
         if not are_invertible(to_world):
             raise CageError(f"{location}: the transform to world space is not invertible; expected one that is")
         with np.errstate(over="ignore", invalid="ignore"):
@@ -58,16 +56,22 @@ class ShapeReader:
                     what = "textures of curves are looked up around them, and along all curves of a prim"
                     self._notes.add(what, prim.GetPath())
                 cage, curves = read_curves(prim, to_world, self._time, names, self._notes)
-                return [replace(self._shape(prim, to_world, cage, None, material), curves=curves)]
+                return [self._completed(prim, ShapeContents(path, cage, to_world, None, material, curves=curves))]
             cage, normals = read_gprim(prim, self._time)
-            return [self._shape(prim, to_world, cage, normals, material)]
+            return [self._completed(prim, ShapeContents(path, cage, to_world, normals, material))]
 
     def _parts(self, prim: Usd.Prim, to_world: NDArray[np.float64], location: str) -> list[ShapeContents]:
         mesh = UsdGeom.Mesh(prim)
         reader = MeshReader(mesh, location, self._skinning, report=self._notes.add_message)
         if str(reader.value(mesh.GetSubdivisionSchemeAttr())) == "bilinear":
             self._notes.add("meshes with the scheme bilinear become polygons", prim.GetPath())
-        self._note_velocities(mesh)
+        time, is_fixed = self._time.GetValue(), self._time.IsEarliestTime()
+        has_velocities = not is_fixed and mesh.GetVelocitiesAttr().HasAuthoredValue()
+        if has_velocities and time not in mesh.GetPointsAttr().GetBracketingTimeSamples(time):
+            what = "velocities of meshes are ignored; their points are interpolated between samples"
+            self._notes.add(what, mesh.GetPath())
+        level = value_at(prim.GetAttribute("mitsuba:subdivision_level"), self._time)
+        rate = min(1 << min(level, 30), HIGHEST_RATE) if isinstance(level, int) and level >= 0 else None
         materials, owner = self._materials_of_faces(mesh, reader)
         shapes = []
         # Parts whose materials need the same primvars share their arrays.
@@ -83,30 +87,18 @@ class ShapeReader:
             shown = None
             if len(materials) > 1:
                 if cage.scheme is not None and len(materials) * len(owner) <= MOST_SHARED_FACES:
-                    # All parts evaluate the whole surface, so that they agree in every bit where they meet.
+                    # Parts evaluate the whole surface, so that they agree in every bit where they meet.
                     shown = np.flatnonzero(owner == number)
                 else:
                     cage = replace(cage, holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
-            shape = self._shape(prim, to_world, cage, normals, material)
-            shapes.append(replace(shape, shown_faces=shown, rate=self._rate(prim)))
+            shape = ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, shown_faces=shown, rate=rate)
+            shapes.append(self._completed(prim, shape))
         return shapes
-
-    def _rate(self, prim: Usd.Prim) -> int | None:
-        level = value_at(prim.GetAttribute("mitsuba:subdivision_level"), self._time)
-        return min(1 << min(level, 30), HIGHEST_RATE) if isinstance(level, int) and level >= 0 else None
-
-    def _note_velocities(self, mesh: UsdGeom.Mesh) -> None:
-        if self._time.IsEarliestTime() or not mesh.GetVelocitiesAttr().HasAuthoredValue():
-            return
-        time = self._time.GetValue()
-        if time not in mesh.GetPointsAttr().GetBracketingTimeSamples(time):
-            what = "velocities of meshes are ignored; their points are interpolated between samples"
-            self._notes.add(what, mesh.GetPath())
 
     def _materials_of_faces(
         self, mesh: UsdGeom.Mesh, reader: MeshReader
     ) -> tuple[list[MaterialContents | None], IntArray]:
-        """Materials of a mesh, and for each face the index of its own among them."""
+        """Materials of a mesh, and the index of the material of each face."""
         prim = mesh.GetPrim()
         materials = [self._materials.bound(prim)]
         owner = np.zeros(len(reader.array(mesh.GetFaceVertexCountsAttr(), np.int64, required=True)), dtype=np.int64)
@@ -114,9 +106,9 @@ class ShapeReader:
             if value_at(subset.GetElementTypeAttr(), self._time) != "face":
                 self._notes.add("materials of subsets other than faces are ignored", subset.GetPath())
                 continue
-            read = partial(_faces_of, reader, subset, len(owner))
-            left_out = f"the subset {subset.GetPrim().GetName()} is left out"
-            faces = reader.fitting(subset.GetIndicesAttr(), left_out, read, _NO_FACES)
+            name = subset.GetPrim().GetName()
+            read = partial(_faces_of, reader, subset.GetIndicesAttr(), len(owner), name)
+            faces = reader.fitting(subset.GetIndicesAttr(), f"the subset {name} is left out", read, _NO_FACES)
             material = self._materials.bound(subset.GetPrim())
             if material not in materials:
                 materials.append(material)
@@ -124,7 +116,6 @@ class ShapeReader:
         return materials, owner
 
     def _primvars(self, material: MaterialContents | None) -> tuple[tuple[str, ...], str | None]:
-        """Names of the attributes that a material needs, and of its texture coordinates."""
         if material is None:
             return COLORS, None
         names = material.texcoords()
@@ -133,14 +124,9 @@ class ShapeReader:
             self._notes.add(what, material.name)
         return tuple(sorted(material.primvars())), next(iter(names), None)
 
-    def _shape(
-        self,
-        prim: Usd.Prim,
-        to_world: NDArray[np.float64],
-        cage: CageContents,
-        normals: NDArray[np.float64] | None,
-        material: MaterialContents | None,
-    ) -> ShapeContents:
+    def _completed(self, prim: Usd.Prim, shape: ShapeContents) -> ShapeContents:
+        """A shape with its texture coordinates, constant primvars and emission."""
+        cage, material = shape.cage, shape.material
         for name, fallback in [] if material is None else [*material.texcoords().items()][:1]:
             cage = self._with_texcoords(prim, cage, name, fallback)
         names = COLORS if material is None else material.primvars()
@@ -153,14 +139,12 @@ class ShapeReader:
             if not np.isfinite(radiance).all():
                 self._notes.add("mesh lights with numbers that are not finite are ignored", prim.GetPath())
                 radiance = None
-        return ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, constants, radiance, is_normalized)
+        return replace(shape, cage=cage, constants=constants, radiance=radiance, is_normalized=is_normalized)
 
     def _with_texcoords(self, prim: Usd.Prim, cage: CageContents, name: str, fallback: Input | None) -> CageContents:
-        """A cage with texture coordinates of a name, or else with others of its own or the fallback."""
-        is_missing, consequence = (
-            not UsdGeom.PrimvarsAPI(prim).HasPrimvar(name),
-            "the first others of the mesh are used",
-        )
+        """A cage with the named texture coordinates, or else with others of its own or the fallback."""
+        is_missing = not UsdGeom.PrimvarsAPI(prim).HasPrimvar(name)
+        consequence = "the first others of the mesh are used"
         if cage.texcoords is None or (is_missing and fallback is not None):
             place = np.zeros(2) if fallback is None else constant(fallback, 2)
             consequence = f"textures are read at ({place[0]:g}, {place[1]:g})"
@@ -170,7 +154,7 @@ class ShapeReader:
         return cage
 
     def _constant(self, prim: Usd.Prim, name: str) -> list[float]:
-        """A primvar of a prim, or of those above, that has one value of one or three numbers; else nothing."""
+        """Value of a constant primvar of a prim or its ancestors, of one or three numbers; else nothing."""
         primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
         if not primvar or not primvar.HasValue() or primvar.GetInterpolation() != UsdGeom.Tokens.constant:
             return []
@@ -185,9 +169,9 @@ class ShapeReader:
         return []
 
 
-def _faces_of(reader: MeshReader, subset: UsdGeom.Subset, face_count: int) -> IntArray:
-    faces = reader.array(subset.GetIndicesAttr(), np.int64)
-    require_range(faces, face_count, f"{reader.location}: subset {subset.GetPrim().GetName()} has")
+def _faces_of(reader: MeshReader, indices: Usd.Attribute, face_count: int, name: str) -> IntArray:
+    faces = reader.array(indices, np.int64)
+    require_range(faces, face_count, f"{reader.location}: subset {name} has")
     return faces
 
 
@@ -198,7 +182,7 @@ def are_invertible(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[CageContents, NDArray[np.float64] | None]:
-    """A Cube, Plane, Sphere, Cylinder, Cone or Capsule as polygons, maybe with normals at face corners."""
+    """A Cube, Plane, Sphere, Cylinder, Cone or Capsule as polygons; round ones with normals at face corners."""
 
     def number(name: str) -> float:
         size = float(value_at(prim.GetAttribute(name), time))
@@ -219,8 +203,7 @@ def read_gprim(prim: Usd.Prim, time: Usd.TimeCode) -> tuple[CageContents, NDArra
         half = np.array([number("width"), number("length"), 0.0]) / 2
         points, vertices = half * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), np.arange(4)
         if axis != "Z":
-            # The width is along x or z, never along y.
-            points, vertices = points[:, [1, 0, 2]], vertices[::-1]
+            points, vertices = points[:, [1, 0, 2]], vertices[::-1]  # The width is along x or z, never along y
     else:
         height = number("height") if prim.HasAttribute("height") else 0.0
         points, normals, vertices = _revolved(_OUTLINES[kind](number("radius"), height / 2))
@@ -233,8 +216,7 @@ def _arc(radius: float, start: float, end: float, height: float) -> Line:
     angle = np.radians(np.linspace(start, end, ALONG + 1))
     normals = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     points = radius * normals + [0, height]
-    # On the axis, exactly.
-    points[np.abs(normals[:, 0]) < 1e-12, 0] = 0
+    points[np.abs(normals[:, 0]) < 1e-12, 0] = 0  # On the axis, exactly
     return points, normals
 
 
@@ -248,12 +230,11 @@ def _lines(*corners: tuple[float, float]) -> list[Line]:
 
 
 def _revolved(parts: list[Line]) -> tuple[NDArray[np.float64], NDArray[np.float64], IntArray]:
-    """Points, normals at face corners and vertices of the quadrilaterals that lines make around the z axis."""
+    """Points, normals at face corners, and vertices of quadrilaterals of lines revolved around the z axis."""
     angle = 2 * np.pi * np.arange(AROUND) / AROUND
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
     def turned(rows: NDArray) -> NDArray:
-        """Concatenated rings."""
         return np.concatenate([np.column_stack([r * circle, np.full(AROUND, z)]) for r, z in rows])
 
     points = np.concatenate([turned(points) for points, _ in parts])

@@ -1,8 +1,7 @@
-"""Scenes of a whole stage: at one time, at times of its file, or of several files."""
+"""Scenes of a stage: at one time, at times of its file, or of a file for each frame."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby, product
@@ -23,8 +22,14 @@ from numpy.typing import NDArray
 
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
-from .own_parameters import with_own_parameters
-from .picture_detail import is_chosen, segments_of, texels_for_pictures, triangles_for_picture, with_rate
+from .picture_detail import (
+    is_chosen,
+    segments_of,
+    texels_for_pictures,
+    triangles_for_picture,
+    with_own_parameters,
+    with_rate,
+)
 from .scaling import scaled, scaled_camera, size_of
 from .scene_entries import LoadedShapes, Surfaces, scene_entries
 from .sensors import NO_BLUR, angles_for, sensor, size_for, with_studio_defaults
@@ -34,55 +39,46 @@ from .textures import Textures
 if TYPE_CHECKING:
     from .stage_walk import StageReader
 
-# What differs between contents where only the camera does.
-_OF_CAMERA = frozenset({"camera", "picture"})
-# Names of parameters of sensors that `mi.traverse` has others for; the field of view is along x.
-_TRAVERSED = {"fov": "x_fov"}
+_OF_CAMERA = frozenset({"camera", "picture"})  # Fields of contents that may differ between frames of one loaded scene
+_TRAVERSED = {"fov": "x_fov"}  # Names of parameters of sensors in `mi.traverse`; the field of view is along x
 
 
-class StageScenes:
-    """Scene source of a whole stage, with the camera and the lights of the studio where it has none.
+class StageScenes(studio.SceneSource[SceneContents]):
+    """Scenes of a whole stage, with the studio's camera and lights if it has none.
 
-    Everything may move: shapes, their control points, instances, lights and the stage's camera. Limit surfaces whose
-    topology stays keep their patches and weights. Where only the camera moves, the scene stays loaded. The studio's
-    lights are there if no frame has lights.
+    Shapes, control points, instances, lights and the camera may move. Limit surfaces with the same topology keep their
+    patches and weights; scenes in which only the camera moves stay loaded.
     """
 
     def __init__(
         self,
-        path: str | Path,  # A USD file; for frames also the name of several, with a number in it
-        look: studio.Look,  # Its view, size and samples
+        path: str | Path,
+        look: studio.Look,
         parameters: dict[str, Any],  # Of every shape `subdivision`
         *,
         time: float | None = None,
         camera: str | None = None,  # Path of the stage's camera
-        numbers: range | None = None,  # Times or numbers of files, if there are frames
-        shutter: int | None = None,  # Sub-frames of each frame, which share its samples; see `_delays`
-        # When the shutter opens and closes, in time codes after the time; by default, as its camera says
-        interval: tuple[float, float] | None = None,
-        over: str | Path | None = None,  # A layer that is stronger than each file
+        numbers: range | None = None,
+        shutter: int | None = None,  # Sub-frames of each frame, which share its samples
+        interval: tuple[float, float] | None = None,  # Time codes of the shutter, in place of the camera's
+        over: str | Path | None = None,  # Layer that is stronger than each file
     ) -> None:
-        self.name = f'"{path}"'
-        self._shutter, self._interval, self._over = shutter, interval, over
-        self._path, self._look, self._spp, self._parameters = path, look, look.spp, parameters
-        self._time, self._camera = time, camera
-        self._has_free_rates = not is_chosen(parameters)
-        self._files = None if numbers is None else studio.FrameFiles(Path(path), numbers)
-        if shutter and self._files is not None and self._files.are_many:
+        super().__init__(path, f'"{path}"', look, time, numbers)
+        self._shutter, self._interval, self._over, self._camera = shutter, interval, over, camera
+        self._spp, self._parameters, self._has_free_rates = look.spp, parameters, not is_chosen(parameters)
+        if shutter and self._has_files:
             raise CageError(f"{self.name}: there is one file for each frame; expected times of one file for a shutter")
         self._reader: StageReader | None = None
         self._notes = StageWarnings([NO_BLUR] if shutter else [])
         self._surfaces = Surfaces()
-        # By which the scene is larger than the stage; and the stage's last contents, with those of the scene.
-        self.factor: float | None = None
+        # The last contents of the stage, and the same in the lengths of the scene.
         self._before: tuple[SceneContents, SceneContents] | None = None
         self._first: tuple[int | None, SceneContents] | None = None
         self._is_lit = False
-        # Of the textures of all frames.
-        self._needed: dict[str, float] | None = None
+        self._needed: dict[str, float] | None = None  # Pixels along the sides of image files, for all frames
 
     def at(self, number: int | None = None) -> SceneContents:
-        """Visible contents of a frame; by default, at the given time, where it is an error if nothing is visible."""
+        """Visible contents of a frame, or of the still picture. Raises CageError if that is empty."""
         if self._first is not None and self._first[0] == number:
             return self._first[1]
         contents = self._read(number)
@@ -92,10 +88,8 @@ class StageScenes:
         return contents
 
     def _read(self, number: int | None, delay: float = 0.0) -> SceneContents:
-        path, time = self._path, self._time
-        if self._files is not None and number is not None:
-            path, time = self._files.file(number), self._files.time(number)
-        if self._reader is None or (self._files is not None and self._files.are_many):
+        path, time = self._file_and_time(number)
+        if self._reader is None or self._has_files:
             require_usd(f'"{path}"')
             from .stage_walk import StageReader
 
@@ -109,8 +103,7 @@ class StageScenes:
             contents = replace(contents, lights=[], shapes=dark if shines else contents.shapes)
         self._parameters = with_rate(self._parameters, contents)
         if contents.has_surfaces:
-            shading = studio.shading_for(studio.variant_in_use(), self._parameters)
-            self._parameters = {**self._parameters, "shading": shading}
+            self._parameters = {**self._parameters, "shading": studio.shading_for(self._parameters)}
         self._is_lit |= contents.is_lit
         look, picture = self._look, contents.picture
         spp = (picture.spp or studio.DEFAULT_SPP) if self._spp is None else self._spp
@@ -120,7 +113,7 @@ class StageScenes:
         return contents
 
     def _enlarged(self, given: SceneContents) -> SceneContents:
-        """Contents with the lengths that they have in the scene; where only the camera moves, of the same shapes."""
+        """Contents in the unit of the scene; with the same shapes if only the camera moves."""
         if self.factor is None:
             self.factor = studio.enlargement(size_of(given)) if self._look.scales else 1.0
         if self.factor == 1:
@@ -144,34 +137,30 @@ class StageScenes:
         return [opens + (closes - opens) * (part + 0.5) / self._shutter for part in range(self._shutter)]
 
     def framing(self, contents: SceneContents) -> tuple[str, studio.View, tuple[int, int]]:
-        """Axis that points up, view and size of the picture."""
         return contents.up, angles_for(contents, self._look), size_for(contents, self._look)
 
     def points(self, contents: SceneContents) -> NDArray[np.float64]:
-        """Points ``(n, 3)`` of all shapes in the world; none if no mesh can be used."""
         return self._surfaces.points(contents)
 
     def has_studio(self, contents: SceneContents) -> bool:
-        """Whether the stage lacks a camera or lights."""
         return contents.camera is None or not contents.is_lit
 
     def remarks(self) -> list[str]:
-        """Remarks on parts of the studio that are added, and on frames that are all the same."""
         contents, reader = self._first and self._first[1], self._reader
         if contents is None or reader is None:
             return []
         is_dark, has_camera = not self._is_lit and self._look.environment is None, contents.camera is not None
         lacking = ["no camera"] * (not has_camera) + ["no visible light"] * is_dark
         added = ["camera"] * (not has_camera) + ["lights"] * (is_dark and self._look.has_studio)
-        said = []
+        remarks = []
         if added:
             dark = f" ({lights})" if is_dark and (lights := reader.dark_lights()) else ""
             what = f"the studio's {' and '.join(added)} {'are' if 'lights' in added else 'is'} added"
             without = "; --no-studio renders without its lights" if "lights" in added else ""
-            said.append(f"{self.name}: {' and '.join(lacking)}{dark}: {what}{without}")
-        if self._files is not None and not self._files.are_many and len(self._files.numbers) > 1 and not reader.moves:
-            said.append(f"{self.name}: nothing changes with time; all frames are the same picture, but for noise")
-        return said
+            remarks.append(f"{self.name}: {' and '.join(lacking)}{dark}: {what}{without}")
+        if self.numbers is not None and not self._has_files and len(self.numbers) > 1 and not reader.moves:
+            remarks.append(f"{self.name}: nothing changes with time; all frames are the same picture, but for noise")
+        return remarks
 
     @timed("Choosing triangles and textures")
     def scene(
@@ -182,11 +171,9 @@ class StageScenes:
         follows_sensor: bool = False,
         turns: Sequence[NDArray[np.float64]] = (),
     ) -> SceneNode:
-        """Entries of a scene, with polygon meshes for `with_meshes`. Raises CageError if no mesh can be used."""
-        parameters = self._parameters
-        rest: SceneNode = {}
-        chosen: dict[ShapeContents, dict[str, Any]] = {}
-        needed: dict[str, float] = {}
+        """Entries of a scene, with polygon meshes for `with_meshes`. Raises CageError without a usable mesh."""
+        parameters, rest = self._parameters, dict[str, Any]()
+        chosen, needed = dict[ShapeContents, dict[str, Any]](), dict[str, float]()
         is_one_picture = points is None
         points = self.points(contents) if points is None else points
         if not len(points) and not self._look.has_studio:
@@ -194,8 +181,9 @@ class StageScenes:
         if len(points):
             rest = with_studio_defaults(contents, points, self._is_lit, self._look, self._notes, self.name)
         if rest and (turns or follows_sensor):
-            sensors = [_turned(rest["sensor"], turn) for turn in turns] or [rest["sensor"]]
-            needed = texels_for_pictures(contents, sensors)
+            place, transform = rest["sensor"]["to_world"], mi.ScalarTransform4f
+            moved = [{**rest["sensor"], "to_world": transform(turn.tolist()) @ place} for turn in turns]
+            needed = texels_for_pictures(contents, moved or [rest["sensor"]])
         if rest and is_one_picture:
             contents, chosen = self._for_picture(contents, rest["sensor"], follows_sensor)
         else:
@@ -212,7 +200,6 @@ class StageScenes:
     def _for_picture(
         self, contents: SceneContents, sensor: SceneNode, follows_sensor: bool
     ) -> tuple[SceneContents, dict[ShapeContents, dict[str, Any]]]:
-        """Contents with copies, and parameters of limit surfaces with the triangles that a picture needs."""
         if not self._has_free_rates or not contents.has_surfaces:
             return self._with_copies(contents)[0], {}
         outline, shading = studio.outline_for(sensor), self._parameters["shading"]
@@ -227,12 +214,11 @@ class StageScenes:
         return contents, {shape: {**others, **more} for shape, more in triangles.items()}
 
     def _with_copies(self, contents: SceneContents) -> tuple[SceneContents, dict[str, Any]]:
-        """Contents with copies, and parameters of every limit surface, if the camera moves or rates are chosen."""
         if mi.Float is float:
             return contents, self._parameters
         rate = int(self._parameters.get("tessellation_rate", studio.MOST_SEGMENTS))
-        copies = Counter(shape for shape, _ in contents.placed_shapes)
-        rates = {shape: np.full(count, rate) for shape, count in copies.items() if shape.cage.scheme is not None}
+        placed = contents.placements.items()
+        rates = {shape: np.full(len(copies), rate) for shape, copies in placed if shape.cage.scheme is not None}
         shading, lowest = self._parameters.get("shading", "vertex"), 1 if self._has_free_rates else rate
         contents, joined = with_copies(contents, rates, shading, self._notes, lowest=lowest)
         if not self._has_free_rates:
@@ -242,7 +228,7 @@ class StageScenes:
     def frames(
         self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
     ) -> Iterator[studio.LoadedScene]:
-        """The scenes of some frames and sub-frames; what stays, or moves with its topology, stays loaded."""
+        """Loaded scenes of some frames and sub-frames; shapes with the same topology stay loaded."""
         self._surfaces = Surfaces()
         first = self._first[1] if self._first else self.at(numbers[0])
         shapes, parameters = LoadedShapes(), self._with_copies(first)[1]
@@ -261,10 +247,9 @@ class StageScenes:
             contents, _ = self._with_copies(given)
             shapes.begin_frame()
             textures = Textures(self._notes, self._needed, self._look.texture_size)
-            others = {**rest, "sensor": seen}
             any_sensor: list[SceneNode] | None = [] if self._has_free_rates else None
             chosen = with_own_parameters(contents, {}, parameters, any_sensor, textures, self._notes)
-            made = contents, others, self._notes, parameters, Surfaces(), textures, chosen
+            made = contents, {**rest, "sensor": seen}, self._notes, parameters, Surfaces(), textures, chosen
             scene = scene_entries(*made, loaded=shapes)
             self._notes.warn(self.name)
             before = given, seen, studio.load_quietly(studio.finished(scene, self._look, given.up), filter_name)
@@ -276,13 +261,12 @@ class StageScenes:
         return sensor(contents.camera, size_for(first, self._look), contents.picture, self._look.spp, self._notes)
 
     def _texels_for_frames(self, first: SceneContents, rest: SceneNode) -> dict[str, float]:
-        """Pixels along the sides of textures that any frame shows; of all frames, so that textures do not change."""
         needed: dict[str, float] = {}
         if not any(material.textures() for material in first.materials):
             return needed
-        numbers = (None,) if self._files is None else self._files.numbers
+        numbers = self.numbers or (None,)
         at = (self._read(number, d) if d else self.at(number) for number, d in product(numbers, self._delays(first)))
-        # Lists of shapes are the same object as long as only the camera moves.
+        # Lists of shapes are one object while only the camera moves.
         for _, alike in groupby(at, lambda contents: contents.shapes):
             frames = list(alike)
             seen = [self._sensor(frame, first, rest) for frame in frames]
@@ -292,19 +276,15 @@ class StageScenes:
 
 
 def _moved_sensor(loaded: studio.LoadedScene, before: SceneNode, seen: SceneNode) -> bool:
-    """Change the sensor of a scene from one entry to another; False, without any change, if that cannot be."""
+    """Change the sensor of a loaded scene from one entry to another; return False if `mi.traverse` cannot."""
     parameters = mi.traverse(loaded.sensor)
-    # Of transforms of Mitsuba, != is always False.
+    # For transforms of Mitsuba, != is always False.
     changed = {name: value for name, value in seen.items() if not eq(value, before.get(name))}
     named = {_TRAVERSED.get(name, name): value for name, value in changed.items()}
     if before.keys() != seen.keys() or not all(name in parameters for name in named):
         return False
     studio.set_parameters(loaded.sensor, named)
     return True
-
-
-def _turned(sensor: SceneNode, turn: NDArray[np.float64]) -> SceneNode:
-    return {**sensor, "to_world": mi.ScalarTransform4f(turn.tolist()) @ sensor["to_world"]}
 
 
 def usd_scene(
@@ -323,10 +303,10 @@ def usd_scene(
 ) -> SceneNode:
     """A whole USD file as a dictionary for ``mi.load_dict``.
 
-    Meshes become limit surfaces, or polygons where they are not to be subdivided; with their transforms, instances,
-    materials, lights and the camera. Where the stage has no lights or no camera, it gets those of the studio. Lengths
-    are those of the stage: below 0.01 units, Mitsuba's shadows leak, which `render` avoids by a larger scene. With many
-    lights, `mitsuba_subdivision.weigh_lights` makes the loaded scene sample each by what it adds to the picture.
+    Meshes become limit surfaces, or polygons without a subdivision scheme; with their transforms, instances, materials,
+    lights and the camera. A stage without lights or a camera gets those of the studio. Lengths are those of the stage:
+    below 0.01 units, Mitsuba's shadows leak, which `render` avoids by a larger scene. With many lights,
+    `mitsuba_subdivision.weigh_lights` makes the loaded scene sample each by its contribution to the picture.
 
     Parameters
     ----------
@@ -335,27 +315,27 @@ def usd_scene(
     mi : module or str
         ``mitsuba`` with a variant set, a variant such as ``mitsuba.llvm_ad_rgb``, or its name: that of the scene.
     time : float, optional
-        Time code. By default, each value is the one that does not depend on time, or else its first sample.
+        Time code. By default, values without time, or else first samples.
     camera : str, optional
-        Path of the camera, such as "/World/camera", or its name. By default that of the render settings, or the first.
+        Path or name of the camera, such as "/World/camera". By default that of the render settings, or the first.
     size : (width, height), optional
-        Pixels of the film. By default those of the render settings, or 640 by as many as the camera's aperture has.
+        Pixels of the film. By default those of the render settings, or 640 and the aspect ratio of the aperture.
     spp : int, optional
         Samples per pixel. By default those of the render settings, or 64.
     view : str or (azimuth, elevation)
         View of the studio's camera, if the stage has no camera.
     texture_size : int, optional
-        Pixels along the sides of textures and UDIM tiles at most. Finer ones than the camera shows are halved.
+        Most pixels along the sides of textures and UDIM tiles. Textures that are finer than the picture are halved.
     transparent : bool
-        Whether pictures have alpha and no background, which render settings can ask for, too. The camera sees no
-        environment, no lamps and no backdrop; meshes that emit light it sees.
+        Whether pictures have alpha and no background, which render settings can ask for, too. The camera sees emissive
+        meshes, but no environment, no lamps and no backdrop.
     over : str or Path, optional
         A USD layer that is stronger than the file: materials, lights, cameras, visibility.
     **parameters
         Of every shape ``subdivision``, such as ``tessellation_rate=4`` or ``shading="vertex"``. By default shading is
-        that of ``shading="auto"``, and triangles are as few as the picture shows, about 4 million at most. With exact
-        shading, outlines are a tenth of a pixel away from the surface as this camera sees them; outside groups,
-        triangles adapt to that. Otherwise all are a 32nd of a pixel away, with 8 segments on each edge at most.
+        that of ``shading="auto"``, and triangles are as few as the picture needs, about 4 million at most. With exact
+        shading, outlines are within a tenth of a pixel of the surface in this camera's picture; outside groups,
+        triangles adapt to that. Otherwise all are within a 32nd of a pixel, with 8 segments on each edge at most.
 
     Returns
     -------
@@ -374,7 +354,7 @@ def usd_scene(
     Warns
     -----
     CageWarning
-        About everything that is ignored or unusable, once for each kind.
+        About ignored and unusable parts, once for each kind.
 
     Examples
     --------

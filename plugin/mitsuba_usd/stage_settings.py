@@ -1,4 +1,4 @@
-"""Render settings, render products and their variables, and parameters of Mitsuba that prims have."""
+"""Render settings, render products and their variables, and authored parameters of Mitsuba."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdRender
 from .contents import WHOLE, PictureContents
 from .stage_warnings import StageWarnings
 
-# Values of attributes that are ignored, with which they have no effect.
+# Ignored attributes, and their values without effect.
 _NEUTRAL: dict[str, list[Any]] = {
     "pixelAspectRatio": [1.0],
     "productType": ["raster"],
@@ -23,18 +23,17 @@ _NEUTRAL: dict[str, list[Any]] = {
     "materialBindingPurposes": [["full", ""], ["full", "preview"]],
     "renderingColorSpace": ["", "lin_rec709", "lin_rec709_scene"],
 }
-# As Gaffer writes this setting of Cycles.
-_TRANSPARENT = "cycles:background:transparent"
-# Of aspectRatioConformPolicy, as `sensors.film_window` has them.
+_TRANSPARENT = "cycles:background:transparent"  # Gaffer's name of this setting of Cycles
+# Values of aspectRatioConformPolicy; the first is the default.
 _CONFORM_POLICIES = ("expandAperture", "cropAperture", "adjustApertureWidth", "adjustApertureHeight")
-# Sources of render variables that are the picture itself.
+# Values of sourceName for the colour of the picture.
 _COLORS = ("raw", "color", "Ci", "C", "rgba", "beauty", "C.*", "C.*[LO]")
 
 
 def read_settings(
     stage: Usd.Stage, time: Usd.TimeCode, notes: StageWarnings
 ) -> tuple[PictureContents, str | None, dict[str, Any]]:
-    """Render settings of a stage, the path of their camera, and what they change of a camera."""
+    """Render settings of a stage, the path of their camera, and fields of `CameraContents` that they override."""
     settings = UsdRender.Settings.GetStageRenderSettings(stage)
     if not settings:
         others = [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdRender.Settings)]
@@ -44,7 +43,7 @@ def read_settings(
         return PictureContents(), None, {}
     prim, path, targets = settings.GetPrim(), settings.GetPath(), settings.GetProductsRel().GetForwardedTargets()
     products = [product for target in targets if (product := UsdRender.Product(stage.GetPrimAtPath(target)))]
-    # What a product states is stronger than the settings. The picture is that of the first.
+    # Opinions of products are stronger than the settings; the first product has the picture.
     parts: list[Any] = [*products, settings]
 
     def value(name: str) -> Any:
@@ -84,14 +83,9 @@ def read_settings(
         changes["shutter"] = [0.0, 0.0]
     if value("disableDepthOfField"):
         changes |= {"lens_radius": 0.0, "focus_distance": 0.0}
-    picture = PictureContents(
-        str(path),
-        size and list(size),
-        np.clip(window or WHOLE, 0, 1).tolist(),
-        bool(value(_TRANSPARENT)),
-        spp,
-        namespaced(prim, "mitsuba:integrator", time),
-    )
+    shown, integrator = np.clip(window or WHOLE, 0, 1).tolist(), namespaced(prim, "mitsuba:integrator", time)
+    resolution = None if size is None else (size[0], size[1])
+    picture = PictureContents(str(path), resolution, shown, bool(value(_TRANSPARENT)), spp, integrator)
     for product in products:
         stem, own = Path(str(value_at(product.GetProductNameAttr(), time))).stem, product.GetPrim().GetName()
         name = own if stem in ("", *picture.products) else stem
@@ -100,7 +94,7 @@ def read_settings(
 
 
 def _variables(product: UsdRender.Product, aovs: dict[str, str], time: Usd.TimeCode, notes: StageWarnings) -> list[str]:
-    """Names of the AOVs of a product, which are added to all; "" for its colour."""
+    """Names of the AOVs of a product, "" for its colour; adds their types to ``aovs``."""
     names = []
     for target in product.GetOrderedVarsRel().GetForwardedTargets():
         variable = UsdRender.Var(product.GetPrim().GetStage().GetPrimAtPath(target))
@@ -116,7 +110,7 @@ def _variables(product: UsdRender.Product, aovs: dict[str, str], time: Usd.TimeC
 
 
 def namespaced(prim: Usd.Prim, namespace: str, time: Usd.TimeCode) -> dict[str, Any]:
-    """Attributes of a prim in a namespace as nested dictionaries: ``film:filter:type`` is the type within two."""
+    """Attributes of a prim in a namespace as nested dictionaries, one for each part of the name."""
     found: dict[str, Any] = {}
     inside = (given for given in prim.GetAuthoredAttributes() if given.GetName().startswith(f"{namespace}:"))
     for attribute in inside:
@@ -130,7 +124,7 @@ def namespaced(prim: Usd.Prim, namespace: str, time: Usd.TimeCode) -> dict[str, 
 
 
 def read_variant(path: str | Path, over: str | Path | None) -> str | None:
-    """Variant of Mitsuba that a stage's render settings ask for; nothing else of the stage is read."""
+    """Variant of Mitsuba in a stage's render settings; nothing else of the stage is read."""
     with suppress(Tf.ErrorException, RuntimeError):
         layers = [layer for file in (over, path) if file and (layer := Sdf.Layer.FindOrOpen(str(file)))]
         root = Sdf.Layer.CreateAnonymous(".usda")

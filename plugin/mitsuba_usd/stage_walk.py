@@ -1,4 +1,4 @@
-"""The visible prims of a whole USD stage as plain data. Instances that look the same are one group, or else copies."""
+"""The visible prims of a stage as plain data, with instances of equal appearance as groups, or else copies."""
 
 from __future__ import annotations
 
@@ -24,34 +24,32 @@ from .stage_meshes import COLORS, GPRIMS, ShapeReader, are_invertible
 from .stage_settings import read_settings
 from .stage_warnings import StageWarnings
 
-# Draw modes by which a viewer shows a model as it is.
-_FULL_MODES = (None, "default", "inherited")
-# Prims that hold others, or that are read with others.
-_SILENT = (
-    "", "Xform", "Scope", "Material", "Shader", "NodeGraph", "Camera", "GeomSubset", "Mesh", "PointInstancer", *GPRIMS,
-    "SkelRoot", "Skeleton",
-)  # fmt: skip
-# Types of prims of a camera's rig.
+_FULL_MODES = (None, "default", "inherited")  # Values of model:drawMode without a proxy
+# Types of containers, and of prims that are read with others.
+_SILENT = ("", "Xform", "Scope", "Material", "Shader", "NodeGraph", "Camera", "GeomSubset", "SkelRoot", "Skeleton")
+# Types of prims of a camera rig.
 _OF_RIGS = ("", "Camera", "Scope", "Xform")
 _SINGULAR = "instances with singular transforms are ignored"
 
 
 class StageReader:
-    """Reads a stage at several times. Where cameras alone move, all but them is read once."""
+    """Reader of a stage at several times; if only cameras move, everything else is read once."""
+
+    _is_still = cached_property(lambda self: is_still(self._stage))
 
     def __init__(
         self,
         path: str | Path,
-        camera: str | None = None,  # Path of the camera. By default that of the stage's render settings, or the first
+        camera: str | None = None,  # By default that of the render settings, or the first
         notes: StageWarnings | None = None,
-        over: str | Path | None = None,  # A layer that is stronger than the file
+        over: str | Path | None = None,  # Layer that is stronger than the file
     ) -> None:
         self._path, self._camera, self._notes, self._over = path, camera, notes or StageWarnings(), over
         self._stage: Usd.Stage | None = None
         self._before: SceneContents | None = None
 
     def at(self, time: float | None = None) -> SceneContents:
-        """Contents at a time code; by default, of values without time, or first samples. Warns of what is ignored."""
+        """Contents at a time code; by default, of values without time, or first samples. Warns of ignored parts."""
         name = f'"{self._path}"'
         if time is not None and not math.isfinite(time):
             raise ValueError(f"{name}: time {time}; expected a finite number, a time code")
@@ -65,21 +63,15 @@ class StageReader:
                 self._before = walk.contents(self._camera)
                 return self._before
 
-    @cached_property
-    def _is_still(self) -> bool:
-        return is_still(self._stage)
-
     @property
     def moves(self) -> bool:
-        """Whether anything that has been read may differ between times."""
+        """Whether any attribute may vary with time."""
         return any(map(_may_vary, _all_prims(self._stage)))
 
     def dark_lights(self) -> str:
-        """Lights of the stage that do not shine, and why; as text, empty without such lights."""
+        """Lights that do not shine, with the reason of each."""
         reasons = []
-        for prim in _all_prims(self._stage):
-            if not prim.HasAPI(UsdLux.LightAPI):
-                continue
+        for prim in (prim for prim in _all_prims(self._stage) if prim.HasAPI(UsdLux.LightAPI)):
             if not prim.IsActive():
                 reasons.append(f"{prim.GetPath()} is inactive")
             elif UsdGeom.Imageable(prim).ComputeVisibility() == UsdGeom.Tokens.invisible:
@@ -90,13 +82,10 @@ class StageReader:
 
 
 def is_still(stage: Usd.Stage) -> bool:
-    """Whether nothing but cameras, with the transforms above them alone, may differ between times."""
-
-    def may_move(prim: Usd.Prim) -> bool:
-        below = Usd.PrimRange.AllPrims(prim) if _may_vary(prim) else []
-        return not all(str(part.GetTypeName()) in _OF_RIGS and not part.IsInstance() for part in below)
-
-    return not any(map(may_move, _all_prims(stage)))
+    """Whether nothing but cameras and their rigs may vary with time."""
+    moving = filter(_may_vary, _all_prims(stage))
+    below = (part for prim in moving for part in Usd.PrimRange.AllPrims(prim))
+    return all(str(part.GetTypeName()) in _OF_RIGS and not part.IsInstance() for part in below)
 
 
 def _all_prims(stage: Usd.Stage) -> Iterator[Usd.Prim]:
@@ -104,11 +93,11 @@ def _all_prims(stage: Usd.Stage) -> Iterator[Usd.Prim]:
 
 
 def _may_vary(prim: Usd.Prim) -> bool:
-    attributes = prim.GetAuthoredAttributes()
-    # Instances go on with their velocities where positions have one time.
-    is_instancer = prim.IsA(UsdGeom.PointInstancer)
-    is_moving = is_instancer and any("elocities" in attribute.GetName() for attribute in attributes)
-    return is_moving or any(attribute.ValueMightBeTimeVarying() for attribute in attributes)
+    is_instancer = prim.IsA(UsdGeom.PointInstancer)  # Velocities move instances whose positions have one time
+    return any(
+        attribute.ValueMightBeTimeVarying() or (is_instancer and "elocities" in attribute.GetName())
+        for attribute in prim.GetAuthoredAttributes()
+    )
 
 
 class _StageWalk:
@@ -121,14 +110,12 @@ class _StageWalk:
         self._transforms: dict[str, Gf.Matrix4d] = {}
         self._materials = MaterialReader(self._code, notes)
         self._shapes = ShapeReader(name, self._code, self._materials, notes)
-        # Numbers of prototypes by what makes them look different, and the prototypes, which have no instances.
+        # Numbers of prototypes by their appearance, and the prototypes, without instances of their own.
         self._numbers: dict[object, int] = {}
         self._prototypes: list[SceneContents] = []
-        # Names of primvars that the shapes of instances read, and whether some of these have places of their own, by
-        # prototype and bindings.
+        # Names of primvars of shapes in instances, and whether a part resets its transform, by prototype and bindings.
         self._inherited: dict[tuple[object, ...], tuple[list[str], bool]] = {}
-        # Paths of instancers whose prototypes are being read.
-        self._open: list[Sdf.Path] = []
+        self._open: list[Sdf.Path] = []  # Instancers whose prototypes are being read
 
     def contents(self, camera: str | None) -> SceneContents:
         up = str(UsdGeom.GetStageUpAxis(self._stage)).lower()
@@ -150,7 +137,7 @@ class _StageWalk:
         return SceneContents(up, whole.shapes, groups, instances, whole.lights, chosen, picture)
 
     def camera(self, wanted: str | None) -> tuple[CameraContents | None, PictureContents]:
-        """The camera of a path, or of a name that no other has; None if there is none; and the render settings."""
+        """The camera of a path or of a unique name, None without cameras; and the render settings."""
         picture, named, changes = read_settings(self._stage, self._code, self._notes)
         path = wanted or named
         prims = self._stage.Traverse(Usd.TraverseInstanceProxies())
@@ -164,24 +151,22 @@ class _StageWalk:
         if path not in cameras and len(alike := [known for known in cameras if known.endswith(f"/{path}")]) == 1:
             path = alike[0]
         if path not in cameras:
-            there = ", ".join(cameras) or "none"
-            raise CageError(f'{self._name}: there is no camera "{path}"; expected one of those there are: {there}')
+            expected = f"one of {', '.join(cameras)}" if cameras else "a stage with cameras"
+            raise CageError(f'{self._name}: there is no camera "{path}"; expected {expected}')
         to_world = self._to_world(cameras[path].GetPrim())
         try:
             return replace(read_camera(cameras[path], to_world, self._code, self._notes), **changes), picture
         except (TypeError, ValueError):
-            raise CageError(
-                f"{self._location(cameras[path])}: the camera is not usable; expected finite numbers, and apertures "
-                "and a focal length above 0"
-            ) from None
+            expected = "finite numbers, and apertures and a focal length above 0"
+            raise CageError(f"{self._location(cameras[path])}: the camera is not usable; expected {expected}") from None
 
     def _location(self, prim: Usd.Prim | UsdGeom.Camera) -> str:
         return f"{self._name}, prim {shortened(str(prim.GetPath()))}"
 
     def _below(self, root: Usd.Prim) -> SceneContents:
-        """Visible contents of a prim and its descendants, in its space, without the prims that cannot be used."""
+        """Visible contents of a prim and its descendants, in its space, without unusable prims."""
         below, to_world = SceneContents(), self._to_world(root)
-        # Of a singular transform, none of it is visible.
+        # Nothing below a singular transform is visible.
         to_root = np.asarray(np.linalg.inv(to_world) if are_invertible(to_world) else np.eye(4))
         above = "" if root.IsPseudoRoot() else str(root.GetPath())
         for prim in self._visible(root):
@@ -197,15 +182,14 @@ class _StageWalk:
         return below
 
     def _visible(self, root: Usd.Prim) -> Iterator[Usd.Prim]:
-        """Visible prims of a subtree, without the descendants of other instances and instancers."""
-        # Prototypes of instancers may lie below a class or an over, as their schema recommends.
+        """Visible prims of a subtree, without the descendants of instances and instancers in it."""
+        # The schema of instancers recommends prototypes below a class or an over.
         prims = iter(_parts(root))
         for prim in prims:
             imageable = UsdGeom.Imageable(prim)
-            is_hidden = prim != root and prim.GetSpecifier() != Sdf.SpecifierDef
-            if is_hidden or (
-                imageable and files.value_at(imageable.GetVisibilityAttr(), self._code) == UsdGeom.Tokens.invisible
-            ):
+            visibility = imageable and files.value_at(imageable.GetVisibilityAttr(), self._code)
+            is_abstract = prim != root and prim.GetSpecifier() != Sdf.SpecifierDef
+            if is_abstract or visibility == UsdGeom.Tokens.invisible:
                 prims.PruneChildren()
                 continue
             if prim.IsA(UsdGeom.PointInstancer) or (prim.IsInstance() and prim != root):
@@ -222,7 +206,6 @@ class _StageWalk:
             return to_root @ self._to_world(prim)
 
         if prim != root and prim.IsInstance():
-            # Instances that differ in appearance belong to different prototypes.
             if are_invertible(placed := matrix()):
                 group = self._prototype(self._appearance(prim), prim)
                 below.instances.append(InstanceContents(name, group, placed))
@@ -239,36 +222,32 @@ class _StageWalk:
         elif prim.HasAPI(UsdLux.LightAPI):
             files.require_types(prim, self._code)
             light = read_light(prim, matrix(), self._code, self._notes)
-            # Without power, it would only keep the studio's lights away.
+            # A light without power would only keep the studio's lights away.
             below.lights.extend([replace(light, name=name)] if light and any(light.emission) else [])
         elif str(prim.GetTypeName()) not in _SILENT:
             self._notes.add(f"prims of type {prim.GetTypeName()} are ignored", prim.GetPath())
 
     def _appearance(self, prim: Usd.Prim) -> tuple[object, ...]:
-        """What an instance inherits that may make it look different from others of its prototype, and the prototype."""
+        """Key that instances of one prototype share if they look the same: the prototype, and what it inherits."""
         binding = UsdSkel.BindingAPI(prim)
         skeleton, animation = binding.GetInheritedSkeleton(), binding.GetInheritedAnimationSource()
-        # A skeleton outside moves the points of each instance otherwise.
+        # A skeleton outside the instance poses each instance by itself.
         is_posed = skeleton and not skeleton.GetPath().HasPrefix(prim.GetPath())
         is_hidden = UsdGeom.Imageable(prim) and UsdGeom.Imageable(prim).ComputePurpose() in files.HIDDEN_PURPOSES
         key = str(prim.GetPrototype().GetPath()), self._bindings(prim), bool(is_hidden)
         if key not in self._inherited:
-            names: set[str] = set()
-            for material in set(self._materials_below(prim)):
-                names.update(COLORS if material is None else material.primvars())
+            materials = set(self._materials_below(prim))
+            names = {name for known in materials for name in (COLORS if known is None else known.primvars())}
             places = map(UsdGeom.Xformable, _parts(prim))
-            is_placed = any(place and place.GetResetXformStack() for place in places)
-            self._inherited[key] = sorted(names), is_placed
+            self._inherited[key] = sorted(names), any(place and place.GetResetXformStack() for place in places)
         names_read, is_placed = self._inherited[key]
-        primvars = [UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name) for name in names_read]
-        # Values and indices, to be compared.
-        texts = [str(files.value_at(primvar.GetAttr(), self._code)) if primvar else "" for primvar in primvars]
-        texts += [str(files.value_at(primvar.GetIndicesAttr(), self._code)) if primvar else "" for primvar in primvars]
+        found = [UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name) for name in names_read]
+        attributes = [(primvar.GetAttr(), primvar.GetIndicesAttr()) if primvar else () for primvar in found]
+        texts = [str([files.value_at(attribute, self._code) for attribute in pair]) for pair in attributes]
         place = str(prim.GetPath()) if is_posed or is_placed else ""
         return *key, *texts, place, str(animation.GetPath()) if animation else ""
 
     def _bindings(self, prim: Usd.Prim) -> tuple[object, ...]:
-        """Bindings of materials that an instance inherits or has; of collections, the materials of its parts."""
         above = (self._stage.GetPrimAtPath(path) for path in prim.GetPath().GetPrefixes())
         if any(ancestor.GetPropertiesInNamespace("material:binding:collection") for ancestor in above):
             return tuple(self._materials_below(prim))
@@ -309,12 +288,11 @@ class _StageWalk:
         for part in ("positions", "orientations", "orientationsf", "scales"):
             attribute = prim.GetAttribute(part)
             count = len((attribute and attribute.Get(time)) or ())
-            # USD itself reads beyond the end of what is too short.
+            # USD reads beyond the end of arrays that are too short.
             if count != len(kinds) and (count or part == "positions"):
                 raise CageError(f"{location}: there are {count} {part}; expected {len(kinds)}, as many as protoIndices")
-        transforms = instancer.ComputeInstanceTransformsAtTime(
-            time, time, UsdGeom.PointInstancer.IncludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
-        )
+        options = UsdGeom.PointInstancer.IncludeProtoXform, UsdGeom.PointInstancer.IgnoreMask
+        transforms = instancer.ComputeInstanceTransformsAtTime(time, time, *options)
         matrices = to_root @ np.array(transforms).reshape(-1, 4, 4).transpose(0, 2, 1)
         is_shown = np.array(mask, dtype=bool) if mask else np.ones(len(kinds), dtype=bool)
         is_usable = are_invertible(matrices)
@@ -324,7 +302,7 @@ class _StageWalk:
         for number in np.unique(kinds).tolist():
             prototype = self._stage.GetPrimAtPath(targets[number])
             if not prototype:
-                self._notes.add("prototypes of point instancers that are not there are ignored", targets[number])
+                self._notes.add("missing prototypes of point instancers are ignored", targets[number])
                 continue
             self._open.append(path)
             try:
@@ -336,7 +314,7 @@ class _StageWalk:
         return instances
 
     def _time_of_instances(self, instancer: UsdGeom.PointInstancer) -> Usd.TimeCode:
-        """Time at which to evaluate an instancer; at the earliest time, velocities would extrapolate to infinity."""
+        """Time of an instancer's first sample in place of the earliest time, to which velocities would extrapolate."""
         if self._code != Usd.TimeCode.EarliestTime():
             return self._code
         moving = (instancer.GetPositionsAttr(), instancer.GetOrientationsAttr(), instancer.GetScalesAttr())
@@ -344,10 +322,9 @@ class _StageWalk:
         return Usd.TimeCode(firsts[0]) if firsts else self._code
 
     def _prototype(self, key: object, root: Usd.Prim) -> int:
-        """Number of a prototype, which is read unless its key is known."""
         if key not in self._numbers:
             below = self._below(root)
-            # Copies, as Mitsuba has no instances within instances.
+            # Mitsuba has no instances within instances.
             flat = SceneContents(shapes=[*below.shapes], lights=[*below.lights])
             for instance in below.instances:
                 _add_copy(flat, self._prototypes[instance.group], instance)
@@ -365,14 +342,11 @@ def _add_copy(contents: SceneContents, prototype: SceneContents, instance: Insta
 
 
 def _can_be_instanced(prototype: SceneContents) -> bool:
-    """Whether Mitsuba has instances of a prototype: no emitters, nor attributes, which it looks up in another place."""
-    is_hindered = (
-        shape.radiance is not None
-        or bool(shape.cage.attributes)
-        or (shape.material is not None and shape.material.is_emissive)
-        for shape in prototype.shapes
-    )
-    return bool(prototype.shapes) and not prototype.lights and not any(is_hindered)
+    """Whether Mitsuba can instance a prototype: not with emitters, nor attributes, which need hits in object space."""
+    shapes = prototype.shapes
+    shines = any(shape.radiance is not None or (shape.material and shape.material.is_emissive) for shape in shapes)
+    has_attributes = any(shape.cage.attributes for shape in shapes)
+    return bool(shapes) and not (prototype.lights or shines or has_attributes)
 
 
 def _parts(root: Usd.Prim) -> Usd.PrimRange:

@@ -1,4 +1,4 @@
-"""Collects problems of a stage, and issues one warning for each kind."""
+"""Problems of a stage, with one warning for each kind."""
 
 from __future__ import annotations
 
@@ -8,36 +8,34 @@ from contextlib import contextmanager
 
 from mitsuba_subdivision.cage import noting_warnings, shortened, warn, without_warnings
 
-# Prims that a message names, and characters of their names that it shows.
-_SHOWN, _LENGTH = 3, 200
-# Details that differ between messages of one kind: texts in parentheses or quotes, paths and numbers.
+_SHOWN, _LENGTH = 3, 200  # Number of prims in a message, and most characters of their names
+# Details in which messages of one kind differ: texts in parentheses or quotes, paths and numbers.
 _DETAILS = re.compile(r"\([^()]*\)|\"[^\"]*\"|(?<!\w)/\S+|\d+(?:[.,]\d+)*")
 
 
 class StageWarnings:
-    """Kinds of problems, and the affected prims. Each kind has one warning, for all times and files."""
+    """Kinds of problems with the affected prims; each kind has one warning, for all times and files."""
 
     def __init__(self, ignored: Iterable[str] = ()) -> None:
         self._warned = set(ignored)
         self._prims: dict[str, list[str]] = {}
-        # First message of each kind whose messages name a prim.
-        self._first: dict[str, str] = {}
+        self._first: dict[str, str] = {}  # First message of each kind whose messages name a prim
 
     def add(self, what: str, prim: object) -> None:
-        """Record a problem of a prim and its consequence, the same text for all of its kind."""
+        """Record a problem of a prim, with its consequence, in the words of its kind."""
         prims = self._prims.setdefault(what, [])
         if str(prim) not in prims:
             prims.append(str(prim))
 
     def add_message(self, message: str, prim: object, kind: str | None = None) -> None:
-        """Record a message that begins with the names of file and prim; those of a kind may differ in details."""
+        """Record a message that begins with the names of file and prim, and has details beyond its kind."""
         kind = _DETAILS.sub("", message.partition(": ")[2]) if kind is None else kind
         self._first.setdefault(kind, message)
         self.add(kind, prim)
 
     @contextmanager
     def given(self, path: str) -> Iterator[None]:
-        """Warn of what is recorded in a ``with`` block when it ends, and of what is warned of in it."""
+        """Issue the problems that a ``with`` block records, and its own warnings, when it ends."""
         try:
             with noting_warnings() as messages, without_warnings():
                 yield
@@ -47,7 +45,7 @@ class StageWarnings:
             self.warn(f'"{path}"')
 
     def warn(self, name: str) -> None:
-        """Warn of each kind that has had no warning; messages begin with the name of the file."""
+        """Issue a warning for each new kind; messages begin with the name of the file."""
         for kind, prims in self._prims.items():
             if kind in self._warned:
                 continue

@@ -1,13 +1,13 @@
-"""Models of surfaces in the terms that they share, which become BSDFs of Mitsuba.
+"""Models of surfaces in common terms, which become BSDFs of Mitsuba.
 
-Each function below is a model: a table of what its inputs mean, in expressions of them. Tested against the models'
-definitions: Standard Surface of Autodesk (1.0.1), OpenPBR (1.1), UsdPreviewSurface (2.6) and glTF PBR (2.0), as the
-library of MaterialX 1.39 has them.
+Each model is a function from its inputs to those of `NEUTRAL`, as expressions: Standard Surface of Autodesk (1.0.1),
+OpenPBR (1.1), UsdPreviewSurface (2.6) and glTF PBR (2.0), as in the library of MaterialX 1.39.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,28 +17,26 @@ from .materialx_nodes import constant, is_all, is_constant, node, node_of
 
 Given = Callable[[str], Input]
 WHITE, BLACK = [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]
-# Of OpenPBR's 82 degrees, where colours of metals differ most.
-COSINE_82 = 1 / 7
-# Difference of reflectances that nobody sees at an edge.
-_VISIBLE = 0.05
+COSINE_82 = 1 / 7  # Cosine of OpenPBR's 82 degrees, where colours of metals differ most
+_VISIBLE = 0.05  # Smallest visible difference of reflectances at an edge
 
 # Material inputs and their defaults. Widths of GGX lobes are the square of roughness.
 NEUTRAL: dict[str, Input] = {
-    "base_color": [0.18, 0.18, 0.18],  # Of diffuse reflection, and of metal seen head-on.
+    "base_color": [0.18, 0.18, 0.18],  # Diffuse reflectance, and reflectance of metal at normal incidence.
     "metalness": 0.0,
-    "edge_color": WHITE,  # Of metal near grazing angles, as Gulbrandsen has it.
-    "specular": 1.0,  # Factors of what a dielectric reflects head-on.
+    "edge_color": WHITE,  # Edge tint of metal [Gulbrandsen 2014].
+    "specular": 1.0,  # Factors of the reflectance of a dielectric at normal incidence.
     "specular_color": WHITE,
     "ior": 1.5,
     "roughness": 0.5,
     "anisotropy": 0.0,  # 1 less the ratio of the two widths of the lobe; their product is that of the roughness.
-    "rotation": 0.0,  # Of the wider direction from that of u, counter-clockwise, in turns.
+    "rotation": 0.0,  # Turns from u to the wider direction, counter-clockwise.
     "transmission": 0.0,
-    "transmission_color": WHITE,  # Of light that goes through the surface, at each side of a body.
-    "depth_color": WHITE,  # Of light after a path of the depth.
+    "transmission_color": WHITE,  # Transmittance of the surface, at each side of a body.
+    "depth_color": WHITE,  # Transmittance of the interior along a path of the depth.
     "depth": 0.0,  # 0 for a body that does not absorb.
-    "thin": 0.0,  # 1 for a sheet: both sides are outside.
-    "translucency": 0.0,  # Of a sheet, the part of diffuse light that goes through.
+    "thin": 0.0,  # 1 for a sheet with its outside on both sides.
+    "translucency": 0.0,  # Diffusely transmitted part of the diffuse light of a sheet.
     "coat": 0.0,
     "coat_roughness": 0.0,
     "coat_ior": 1.5,
@@ -50,7 +48,7 @@ NEUTRAL: dict[str, Input] = {
 
 
 def material(name: str, model: str, given: Mapping[str, Input]) -> MaterialContents:
-    """A material of a model, with all inputs that the model needs; ``normal`` is in tangent space, from -1 to 1."""
+    """A material from all inputs of its model; ``normal`` is in tangent space, from -1 to 1."""
     shared = MODELS[model](lambda input_name: given.get(input_name, 0.0))
     inputs = {key: value for key, value in shared.items() if not (is_constant(value) and value == NEUTRAL[key])}
     normal = given.get("normal", given.get("geometry_normal", 0.0))
@@ -60,21 +58,21 @@ def material(name: str, model: str, given: Mapping[str, Input]) -> MaterialConte
 def standard_surface(i: Given) -> dict[str, Input]:
     """Autodesk Standard Surface."""
     coat = i("coat")
-    gamma = plus(1.0, times(i("coat_affect_color"), coat))
-    diffuse = mixed(
-        times(i("base"), powered(i("base_color"), gamma)), powered(i("subsurface_color"), gamma), i("subsurface")
+    gamma = _plus(1.0, _times(i("coat_affect_color"), coat))
+    diffuse = _mixed(
+        _times(i("base"), _powered(i("base_color"), gamma)), _powered(i("subsurface_color"), gamma), i("subsurface")
     )
-    metal = times(i("base"), i("base_color"))
-    below = times(mixed(WHITE, i("coat_color"), coat), _below_coat(coat, i("coat_IOR")))
+    metal = _times(i("base"), i("base_color"))
+    below = _times(_mixed(WHITE, i("coat_color"), coat), _below_coat(coat, i("coat_IOR")))
     roughening = number("multiply", number("multiply", i("coat_affect_roughness"), coat), i("coat_roughness"))
     return {
-        "base_color": times(mixed(diffuse, metal, i("metalness")), below),
+        "base_color": _times(_mixed(diffuse, metal, i("metalness")), below),
         "metalness": i("metalness"),
-        "edge_color": times(i("specular"), i("specular_color")),
+        "edge_color": _times(i("specular"), i("specular_color")),
         "specular": i("specular"),
         "specular_color": i("specular_color"),
         "ior": i("specular_IOR"),
-        "roughness": mixed(i("specular_roughness"), 1.0, roughening, "float"),
+        "roughness": _mixed(i("specular_roughness"), 1.0, roughening, "float"),
         "anisotropy": i("specular_anisotropy"),
         "rotation": i("specular_rotation"),
         "transmission": i("transmission"),
@@ -86,7 +84,7 @@ def standard_surface(i: Given) -> dict[str, Input]:
         "coat_ior": i("coat_IOR"),
         "sheen": i("sheen"),
         "sheen_color": i("sheen_color"),
-        "emission": times(times(i("emission"), i("emission_color")), below),
+        "emission": _times(_times(i("emission"), i("emission_color")), below),
         "opacity": node("extract", "float", in_=node("luminance", "color3", in_=i("opacity")), index=0.0),
     }
 
@@ -94,26 +92,26 @@ def standard_surface(i: Given) -> dict[str, Input]:
 def open_pbr_surface(i: Given) -> dict[str, Input]:
     """OpenPBR Surface of the Academy Software Foundation."""
     coat, metalness = i("coat_weight"), i("base_metalness")
-    metal = times(i("base_weight"), i("base_color"))
-    diffuse = mixed(metal, i("subsurface_color"), i("subsurface_weight"))
-    base = mixed(diffuse, times(i("specular_weight"), metal), metalness)
-    # What the coat reflects back inwards: (1 - K) / (1 - E K), with the albedo E of what is below.
-    through = complement(reflectance(i("coat_ior")))
-    inner = complement(number("divide", through, number("multiply", i("coat_ior"), i("coat_ior"))))
-    kept = node("subtract", "color3", in1=WHITE, in2=times(inner, base))
-    darkening = node("divide", "color3", in1=times(complement(inner), WHITE), in2=kept)
-    darkened = mixed(WHITE, darkening, number("multiply", coat, i("coat_darkening")))
-    below = times(times(darkened, mixed(WHITE, i("coat_color"), coat)), _below_coat(coat, i("coat_ior")))
+    metal = _times(i("base_weight"), i("base_color"))
+    diffuse = _mixed(metal, i("subsurface_color"), i("subsurface_weight"))
+    base = _mixed(diffuse, _times(i("specular_weight"), metal), metalness)
+    # Internal reflection K of the coat: (1 - K) / (1 - E K), with the albedo E of the base.
+    through = _complement(reflectance(i("coat_ior")))
+    inner = _complement(number("divide", through, number("multiply", i("coat_ior"), i("coat_ior"))))
+    kept = node("subtract", "color3", in1=WHITE, in2=_times(inner, base))
+    darkening = node("divide", "color3", in1=_times(_complement(inner), WHITE), in2=kept)
+    darkened = _mixed(WHITE, darkening, number("multiply", coat, i("coat_darkening")))
+    below = _times(_times(darkened, _mixed(WHITE, i("coat_color"), coat)), _below_coat(coat, i("coat_ior")))
     of_coat = number("multiply", 2.0, number("power", i("coat_roughness"), 4.0))
-    fourth = plus(number("power", i("specular_roughness"), 4.0), of_coat)
-    rough = mixed(i("specular_roughness"), number("power", number("min", fourth, 1.0), 0.25), coat, "float")
+    fourth = _plus(number("power", i("specular_roughness"), 4.0), of_coat)
+    rough = _mixed(i("specular_roughness"), number("power", number("min", fourth, 1.0), 0.25), coat, "float")
     # Widths are r^2 sqrt(2 / (1 + (1 - a)^2)) and (1 - a) of that.
-    narrow = complement(i("specular_roughness_anisotropy"))
-    product = number("divide", number("multiply", 2.0, narrow), plus(1.0, number("multiply", narrow, narrow)))
+    narrow = _complement(i("specular_roughness_anisotropy"))
+    product = number("divide", number("multiply", 2.0, narrow), _plus(1.0, number("multiply", narrow, narrow)))
     return {
-        "base_color": times(base, below),
+        "base_color": _times(base, below),
         "metalness": metalness,
-        "edge_color": edge_color(times(base, below), i("specular_color")),
+        "edge_color": edge_color(_times(base, below), i("specular_color")),
         "specular": i("specular_weight"),
         "specular_color": i("specular_color"),
         "ior": i("specular_ior"),
@@ -122,14 +120,14 @@ def open_pbr_surface(i: Given) -> dict[str, Input]:
         "transmission": i("transmission_weight"),
         **_colors_of_depth(i("transmission_color"), i("transmission_depth")),
         "thin": i("geometry_thin_walled"),
-        # Half of what a sheet scatters goes through.
+        # A sheet transmits half of the scattered light.
         "translucency": number("multiply", number("multiply", i("geometry_thin_walled"), i("subsurface_weight")), 0.5),
         "coat": coat,
         "coat_roughness": i("coat_roughness"),
         "coat_ior": i("coat_ior"),
         "sheen": i("fuzz_weight"),
         "sheen_color": i("fuzz_color"),
-        "emission": times(times(i("emission_luminance"), i("emission_color")), below),
+        "emission": _times(_times(i("emission_luminance"), i("emission_color")), below),
         "opacity": i("geometry_opacity"),
     }
 
@@ -137,8 +135,8 @@ def open_pbr_surface(i: Given) -> dict[str, Input]:
 def preview_surface(i: Given) -> dict[str, Input]:
     """UsdPreviewSurface.
 
-    By its specification, opacity below 1 is glass if ``opacityMode`` is transparent, as it is by default. Pictures of
-    opacity are the cut-outs of leaves and fences, as long as the mode is not authored.
+    By its specification, opacity below 1 is glass if ``opacityMode`` is transparent, its default. Images of opacity
+    are cut-outs of leaves and fences, unless the mode is authored.
     """
     is_specular = i("useSpecularWorkflow") == 1
     opacity, threshold, mode = i("opacity"), i("opacityThreshold"), i("opacityMode")
@@ -148,7 +146,7 @@ def preview_surface(i: Given) -> dict[str, Input]:
         presence = node("ifgreatereq", "float", value1=opacity, value2=threshold, in1=1.0, in2=0.0)
     elif mode == "transparent" or (mode in ("", 0.0) and is_constant(opacity)):
         presence, transmission = 1.0, node("invert", "float", in_=opacity, amount=1.0)
-    base = times(i("diffuseColor"), _below_coat(i("clearcoat"), i("ior")))
+    base = _times(i("diffuseColor"), _below_coat(i("clearcoat"), i("ior")))
     return {
         "base_color": base,
         "metalness": 0.0 if is_specular else i("metallic"),
@@ -173,13 +171,13 @@ def gltf_pbr(i: Given) -> dict[str, Input]:
     below = _below_coat(coat, 1.5)
     # Widths are r^2 and that mixed with 1 by the square of the strength.
     narrow = number("multiply", i("roughness"), i("roughness"))
-    wide = mixed(narrow, 1.0, number("multiply", i("anisotropy_strength"), i("anisotropy_strength")), "float")
+    wide = _mixed(narrow, 1.0, number("multiply", i("anisotropy_strength"), i("anisotropy_strength")), "float")
     is_isotropic = i("anisotropy_strength") == 0
     is_thin = i("thickness") == 0
-    anisotropy = complement(number("divide", narrow, number("max", wide, 1e-6)))
+    anisotropy = _complement(number("divide", narrow, number("max", wide, 1e-6)))
     colors = [node("extract", "float", in_=i("sheen_color"), index=float(k)) for k in range(3)]
     sheen = number("max", number("max", colors[0], colors[1]), colors[2])
-    base = times(i("base_color"), below)
+    base = _times(i("base_color"), below)
     return {
         "base_color": base,
         "metalness": i("metallic"),
@@ -198,44 +196,34 @@ def gltf_pbr(i: Given) -> dict[str, Input]:
         "coat_roughness": i("clearcoat_roughness"),
         "sheen": sheen,
         "sheen_color": WHITE if sheen == 0 else node("divide", "color3", in1=i("sheen_color"), in2=sheen),
-        "emission": times(i("emissive_strength"), i("emissive")),
+        "emission": _times(i("emissive_strength"), i("emissive")),
         "opacity": 1.0 if mode == 0 else cut if mode == 1 else i("alpha"),
     }
 
 
-def times(a: Input, b: Input) -> Input:
-    """Product as a colour."""
-    return node("multiply", "color3", in1=a, in2=b)
+def _color(category: str, a: Input, b: Input) -> Input:
+    return node(category, "color3", in1=a, in2=b)
 
 
-def powered(a: Input, exponent: Input) -> Input:
-    """Power of a colour."""
-    return node("power", "color3", in1=a, in2=exponent)
-
-
-def mixed(background: Input, foreground: Input, amount: Input, kind: str = "color3") -> Input:
-    """Mixture of colours, or of numbers."""
+def _mixed(background: Input, foreground: Input, amount: Input, kind: str = "color3") -> Input:
     return node("mix", kind, bg=background, fg=foreground, mix=amount)
 
 
 def number(category: str, a: Input, b: Input) -> Input:
-    """A number of two numbers."""
+    """Node "float" with the inputs "in1" and "in2"."""
     return node(category, "float", in1=a, in2=b)
 
 
-def plus(a: Input, b: Input) -> Input:
-    """Sum of numbers."""
-    return number("add", a, b)
+_times, _powered, _plus = partial(_color, "multiply"), partial(_color, "power"), partial(number, "add")
 
 
-def complement(a: Input) -> Input:
-    """1 less a number."""
-    return plus(1.0, number("multiply", -1.0, a))
+def _complement(a: Input) -> Input:
+    return _plus(1.0, number("multiply", -1.0, a))
 
 
 def reflectance(ior: Input) -> Input:
     """Reflectance of an index of refraction at normal incidence."""
-    root = number("divide", plus(ior, -1.0), plus(ior, 1.0))
+    root = number("divide", _plus(ior, -1.0), _plus(ior, 1.0))
     return number("multiply", root, root)
 
 
@@ -262,7 +250,7 @@ def conductor_reflectance(n: ArrayLike, k: ArrayLike, cosine: float) -> NDArray[
 
 
 def schlick_reflectance(reflectivity: ArrayLike, cosine: float) -> NDArray[np.float64]:
-    """Reflectance of a metal that turns to white as Schlick has it."""
+    """Reflectance of a metal by Schlick's approximation, white at grazing angles."""
     r = np.asarray(reflectivity, dtype=np.float64)
     return r + (1 - r) * (1 - cosine) ** 5
 
@@ -279,7 +267,7 @@ def edge_color(reflectivity: Input, at_82_degrees: Input) -> Input:
 
 
 def has_white_edges(base: Input, edge: Input) -> bool:
-    """Whether a metal turns to white towards its edges as Schlick has it, and `principled`, as far as one sees."""
+    """Whether a metal looks like Schlick's approximation, and so `principled`, near grazing angles."""
     if not (is_constant(base) and is_constant(edge)):
         return is_all(edge, 1)
     color = constant(base, 3)
@@ -288,16 +276,14 @@ def has_white_edges(base: Input, edge: Input) -> bool:
 
 
 def _below_coat(coat: Input, ior: Input) -> Input:
-    """Transmittance of a coat at normal incidence."""
-    return complement(number("multiply", coat, reflectance(ior)))
+    return _complement(number("multiply", coat, reflectance(ior)))
 
 
 def _colors_of_depth(color: Input, depth: Input) -> dict[str, Input]:
-    """A colour of transmission is a tint, or that after a path of the depth."""
     return {"transmission_color": color} if depth == 0 else {"depth_color": color, "depth": depth}
 
 
-# Maps from a model's inputs to those of `NEUTRAL`, and the names of inputs without a counterpart.
+# Models, and the names of inputs without a counterpart in `NEUTRAL`.
 MODELS: dict[str, Callable[[Given], dict[str, Input]]] = {
     "standard_surface": standard_surface,
     "open_pbr_surface": open_pbr_surface,
@@ -325,7 +311,7 @@ PREVIEW: dict[str, Input] = {
 
 
 def with_shape(given: Input, values: Mapping[str, list[float]]) -> Input:
-    """An expression with the attributes that a mesh has as constants."""
+    """An expression with the constant primvars of a mesh as numbers."""
     if isinstance(given, PrimvarContents):
         value = values.get(given.name, given.fallback)
         return value[0] if len(value) == 1 else value

@@ -1,4 +1,4 @@
-"""Reads texture images: files, files in archives, and UDIM tiles."""
+"""Pixels of texture images: of files, of files in archives, and of UDIM tiles."""
 
 from __future__ import annotations
 
@@ -18,26 +18,21 @@ from mitsuba_subdivision.srgb import decoded, encoded
 from numpy.typing import NDArray
 
 UDIM = "<UDIM>"
-# From the texture coordinates of USD, whose v points up, to those of Mitsuba's bitmaps, and back.
+# Between texture coordinates of USD, whose v points up, and those of Mitsuba's bitmaps.
 V_DOWN = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
-# A file within an archive: archive.usdz[folder/file.png].
+# File in an archive: archive.usdz[folder/file.png].
 _IN_ARCHIVE = re.compile(r"(.*\.usdz)\[(.*)\]$")
 _JPEG = b"\xff\xd8"
 _EXR = b"\x76\x2f\x31\x01"
-# Chromaticities of red, green, blue and white. Mitsuba leaves those that are nearly these as they are.
+# Chromaticities of red, green, blue and white, and Mitsuba's tolerance for them.
 _REC_709 = np.array([(0.64, 0.33), (0.3, 0.6), (0.15, 0.06), (0.3127, 0.329)])
 _SAME_PRIMARIES = 1e-6
 # From XYZ to responses of cones (Lam 1985).
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-# Of blocks of 8 by 8 pixels, one value.
-_MOST_SCALE = 8
-# Tile 1001 + u + 10 v lies at texture coordinates from (u, v) to (u + 1, v + 1).
-_FIRST_TILE, _TILES_IN_ROW = 1001, 10
-
-# Integers up to this are decoded by a table.
-_TABULATED = 65535
-# Linear values take four times the memory of bytes.
-_PIXELS_AT_ONCE = 1 << 18
+_MOST_SCALE = 8  # Largest scale of a decoded JPEG file, with one value of each block of 8 by 8 pixels
+_FIRST_TILE, _TILES_IN_ROW = 1001, 10  # Tile 1001 + u + 10 v covers texture coordinates from (u, v) to (u + 1, v + 1)
+_TABULATED = 65535  # Largest integers that a table decodes
+_PIXELS_AT_ONCE = 1 << 18  # Pixels that are halved at once, as linear values take four times the memory of bytes
 # Linear values of 16 bits for bytes of sRGB, and back.
 _LINEAR = np.round(65535 * decoded(np.arange(256) / 255)).astype(np.uint16)
 _ENCODED = np.round(255 * encoded(np.arange(65536) / 65535)).astype(np.uint8)
@@ -47,23 +42,18 @@ _ENCODED = np.round(255 * encoded(np.arange(65536) / 65535)).astype(np.uint8)
 class TextureImage:
     """Pixels of one file, or of the bounding box of all existing tiles."""
 
-    # (h, w, channels) array: as they are in the file; the first row is the uppermost. Where there is no tile, they
-    # are zero.
-    pixels: NDArray
-    # (3, 3) float64: from texture coordinates, whose v points up, to those of the picture, which are from 0 to 1
-    to_uv: NDArray[np.float64]
-    # (h, w) bool, or None: whether there is a tile; None if the picture is everywhere
-    is_there: NDArray[np.bool_] | None = None
+    pixels: NDArray  # (h, w, channels): as in the file, the uppermost row first; 0 where a tile is missing
+    to_uv: NDArray[np.float64]  # (3, 3): from texture coordinates to those of the image, from 0 to 1, v up
+    has_tile: NDArray[np.bool_] | None = None  # (h, w): mask of existing tiles; None without missing tiles
 
 
 def read_texture_image(
-    path: str,  # `a.usdz[b.png]` for a file in an archive. With "<UDIM>" in it, all tiles that there are.
-    color_space: str = "auto",  # In which files are halved
-    # Pixels along the sides of a file that its use needs; files that have more are halved, see `halvings`
-    needed: float = math.inf,
-    most: int | None = None,  # Pixels along the sides of a file at most
+    path: str, color_space: str = "auto", needed: float = math.inf, most: int | None = None
 ) -> TextureImage:
-    """Read the image of a texture. Raises OSError, RuntimeError, KeyError, zipfile.BadZipFile if it cannot be read."""
+    """Read a file, ``a.usdz[b.png]``, or all tiles of a path with "<UDIM>", with sides as in `halvings`.
+
+    Raises OSError, RuntimeError, KeyError, zipfile.BadZipFile if it is unreadable.
+    """
     if UDIM not in path:
         return TextureImage(_pixels(path, color_space, needed, most), np.eye(3))
     from pxr import UsdShade
@@ -77,12 +67,11 @@ def read_texture_image(
 
 
 def _joined(tiles: list[NDArray], uv: NDArray[np.int64]) -> TextureImage:
-    """One image of all tiles, at ``(n, 2)``; smaller ones are enlarged to the size of the largest."""
     first, (columns, rows) = uv.min(axis=0), np.ptp(uv, axis=0) + 1
     height, width, channels = np.max([tile.shape for tile in tiles], axis=0)
     dtype = max((tile.dtype for tile in tiles), key=lambda dtype: (dtype.kind == "f", dtype.itemsize))
     pixels = np.zeros((rows, height, columns, width, channels), dtype=dtype)
-    is_there = np.zeros((rows, height, columns, width), dtype=bool)
+    has_tile = np.zeros((rows, height, columns, width), dtype=bool)
     for (column, above), of_file in zip(uv - first, tiles, strict=True):
         row = rows - 1 - above
         tile = of_file if of_file.shape[2] == channels else with_alpha(of_file)[..., :channels]
@@ -90,14 +79,11 @@ def _joined(tiles: list[NDArray], uv: NDArray[np.int64]) -> TextureImage:
             values = _resampled(tile.astype(np.float32) / np.float32(_full(tile.dtype)), (height, width))
             tile = (values if dtype.kind == "f" else np.rint(values * _full(dtype))).astype(dtype)
         pixels[row, :, column] = tile
-        is_there[row, :, column] = True
+        has_tile[row, :, column] = True
     to_uv = np.diag([1 / columns, 1 / rows, 1.0])
     to_uv[:2, 2] = -first / (columns, rows)
-    return TextureImage(
-        pixels.reshape(rows * height, columns * width, channels),
-        to_uv,
-        None if is_there.all() else is_there.reshape(rows * height, columns * width),
-    )
+    mask = None if has_tile.all() else has_tile.reshape(rows * height, columns * width)
+    return TextureImage(pixels.reshape(rows * height, columns * width, channels), to_uv, mask)
 
 
 def with_alpha(picture: NDArray) -> NDArray:
@@ -113,8 +99,7 @@ def with_alpha(picture: NDArray) -> NDArray:
 def _resampled(values: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
     if values.shape[:2] == size:
         return values
-    # The filter goes beyond the values that there are.
-    bounds = float(values.min()), float(values.max())
+    bounds = float(values.min()), float(values.max())  # The filter overshoots
     return np.array(mi.Bitmap(values).resample(mi.ScalarVector2u(size[1], size[0]), clamp=bounds)).reshape(*size, -1)
 
 
@@ -123,7 +108,7 @@ def _full(dtype: np.dtype) -> int:
 
 
 def is_srgb_image(pixels: NDArray, color_space: str) -> bool:
-    """Whether an image is to be decoded from sRGB, by the rule of UsdUVTexture."""
+    """Whether an image has encoded sRGB, by the rule of UsdUVTexture."""
     return color_space == "sRGB" or (color_space == "auto" and pixels.dtype == np.uint8 and pixels.shape[2] >= 3)
 
 
@@ -133,8 +118,7 @@ def _pixels(path: str, color_space: str, needed: float, most: int | None) -> NDA
         with zipfile.ZipFile(inside[1]) as archive:
             content = archive.read(inside[2])
     else:
-        # Mitsuba's own message about a missing file is several lines long.
-        content = Path(path).read_bytes()
+        content = Path(path).read_bytes()  # Mitsuba's message about a missing file has several lines
     pixels: NDArray | None = _scaled_jpeg(content, color_space, needed, most) if content.startswith(_JPEG) else None
     if pixels is None:
         stream = mi.MemoryStream()
@@ -161,10 +145,9 @@ def _names_srgb(png: bytes) -> bool:
 
 
 def _in_rec_709(pixels: NDArray, is_xyz: bool, content: bytes, color_space: str) -> NDArray:
-    """Pixels of an OpenEXR file with the primaries and the white of Rec. 709; raw ones as they are in the file.
+    """Pixels of an OpenEXR file with the primaries and the white of Rec. 709; raw pixels as in the file.
 
-    Mitsuba converts primaries that the header names, but neither XYZ nor the white: grey would get the tint of the
-    header's white.
+    Mitsuba converts primaries, but neither XYZ nor the white: grey would get the tint of the file's white.
     """
     import OpenEXR
 
@@ -180,7 +163,7 @@ def _in_rec_709(pixels: NDArray, is_xyz: bool, content: bytes, color_space: str)
     elif color_space == "raw":
         matrix = np.linalg.inv(from_xyz @ _to_xyz(named))
     else:
-        # From what is white under one light to what is white under the other, by Bradford's cones.
+        # Chromatic adaptation of Bradford from one white to the other.
         before, after = (_BRADFORD @ _to_xyz(primaries) @ np.ones(3) for primaries in (named, _REC_709))
         adaptation = np.linalg.inv(_BRADFORD) @ np.diag(after / before) @ _BRADFORD
         matrix = from_xyz @ adaptation @ np.linalg.inv(from_xyz)
@@ -189,7 +172,7 @@ def _in_rec_709(pixels: NDArray, is_xyz: bool, content: bytes, color_space: str)
 
 
 def _to_xyz(chromaticities: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrix ``(3, 3)`` to XYZ from primaries ``(4, 2)``, the last of which is the white, with Y = 1."""
+    """Matrix ``(3, 3)`` to XYZ from three primaries and a white ``(4, 2)`` with Y = 1."""
     x, y = chromaticities.T
     red, green, blue, white = np.stack([x, y, 1 - x - y], axis=1)
     primaries = np.stack([red, green, blue], axis=1)
@@ -197,9 +180,9 @@ def _to_xyz(chromaticities: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _scaled_jpeg(content: bytes, color_space: str, needed: float, most: int | None) -> NDArray[np.uint8] | None:
-    """A JPEG file decoded at a scale, which takes a third of the time; None if all of it is needed, unless it is CMYK.
+    """Decode a JPEG file at a scale, in a third of the time; return None if all pixels are needed, unless it is CMYK.
 
-    Scales are means of encoded values. Of colours in sRGB, the last halving is left to `reduced`.
+    Scaled values are means of encoded ones. For sRGB, the last halving is left to `reduced`.
     """
     try:
         # Image.open refuses pictures of 13,400 by 13,400 pixels and more.
@@ -209,8 +192,7 @@ def _scaled_jpeg(content: bytes, color_space: str, needed: float, most: int | No
     try:
         opened = JpegImageFile(io.BytesIO(content))
     except SyntaxError:
-        # Mitsuba tells what is wrong.
-        return None
+        return None  # Mitsuba raises an error with the reason
     with opened as image:
         if image.mode == "CMYK":
             return np.array(image.convert("RGB"))
@@ -223,10 +205,7 @@ def _scaled_jpeg(content: bytes, color_space: str, needed: float, most: int | No
 
 
 def halvings(size: Sequence[int], needed: float, most: int | None = None) -> int:
-    """How often an image with sides of so many pixels is halved, rounded up.
-
-    Its sides stay at least as long as needed, or as they are, and become as short as the most, whatever is needed.
-    """
+    """Number of times that an image is halved, rounded up, to sides of at least ``needed`` and at most ``most``."""
     shorter, longer = sorted(size)
     count = 0
     while longer > 1 and (shorter >= 2 * max(needed, 1) or (most is not None and longer > most)):
@@ -235,7 +214,7 @@ def halvings(size: Sequence[int], needed: float, most: int | None = None) -> int
 
 
 def reduced(pixels: NDArray, needed: float, most: int | None = None, *, is_srgb: bool) -> NDArray:
-    """An image ``(h, w, c)`` halved as often as `halvings` says; in sRGB, colours are encoded, and alpha is linear."""
+    """Halve an image ``(h, w, c)`` as often as `halvings` returns; in sRGB, alpha is linear."""
     count = halvings(pixels.shape[:2], needed, most)
     if not count:
         return pixels
@@ -246,7 +225,7 @@ def reduced(pixels: NDArray, needed: float, most: int | None = None, *, is_srgb:
 
 
 def linear_values(pixels: NDArray, is_srgb: bool, channels: Sequence[int] = (0, 1, 2, 3)) -> NDArray[np.float32]:
-    """Values of channels as linear numbers; alpha, the channel 3, is linear already."""
+    """Linear values of channels; alpha, the channel 3, is linear in the file."""
     if pixels.dtype.kind != "u":
         values = pixels.astype(np.float32)
         if is_srgb:

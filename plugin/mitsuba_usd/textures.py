@@ -1,4 +1,4 @@
-"""Pictures of materials and lights, and expressions of pictures and texture coordinates, as Mitsuba's bitmaps."""
+"""Images of materials and lights, and expressions of images and texture coordinates, as Mitsuba's bitmaps."""
 
 from __future__ import annotations
 
@@ -22,81 +22,75 @@ from .texture_image import V_DOWN, TextureImage, is_srgb_image, linear_values, r
 # Baked resolution without images, and with large tiled images.
 LEAST_PROCEDURAL, MOST = 1024, 4096
 _PIXELS_AT_ONCE = 1 << 20
+_RAMPS = {"ramplr", "ramptb", "splitlr", "splittb"}
 Image = TextureContents | NodeContents
-# Values (h, w, k) of a picture's channel, and the transform (3, 3) from texture coordinates to those of the picture.
-Picture = tuple[Values, NDArray[np.float64]]
-# Values (h, w, k) of an expression, the uppermost row first; the transform (3, 3) from texture coordinates, whose v
-# points up, to those of the picture, from 0 to 1; and Mitsuba's wrap mode.
-Baked = tuple[NDArray[np.float32], NDArray[np.float64], str]
+# Values (h, w, k), the uppermost row first; and the transform (3, 3) from texture coordinates, whose v points up, to
+# those of the image, from 0 to 1.
+Picture = tuple[NDArray[np.float32], NDArray[np.float64]]
 
 
 class Textures:
-    """Builds textures from images, each of which is read once."""
+    """Builder of textures from images, each read once.
 
-    def __init__(
-        self,
-        notes: StageWarnings,
-        # Pixels along the sides of textures of materials that pictures show; see `texels_for_pictures`
-        needed: Mapping[str, float] | None = None,
-        most: int | None = None,  # Pixels along their sides at most
-    ) -> None:
+    Sides of image files have as many pixels as pictures need (see `texels_for_pictures`), and the given number at most.
+    """
+
+    def __init__(self, notes: StageWarnings, needed: dict[str, float] | None = None, most: int | None = None) -> None:
         self._notes, self._needed, self._most = notes, needed or {}, most
-        # By file and the colour space in which it is halved; whole ones have none.
+        # By file and the colour space in which it is halved; None for whole images.
         self._pictures: dict[tuple[str, str | None], TextureImage | None] = {}
-        # In eight bits, by file, channel and whether they are decoded.
+        # Bitmaps of eight bits, by file, channel and whether they are decoded.
         self._bitmaps: dict[tuple[str, str, bool], mi.Bitmap] = {}
-        # Expressions and their pictures, by the identity of the expression.
+        # Expressions with their baked images, by the identity of the expression.
         self._expressions: dict[int, tuple[NodeContents, TextureContents, TextureImage]] = {}
 
     def read(self, uses: Iterable[TextureContents]) -> None:
-        """Read the pictures of textures on all processors."""
+        """Read the images of textures on all processors."""
         keys = [key for key in dict.fromkeys((use.file, use.color_space) for use in uses) if key not in self._pictures]
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             for key, picture in zip(keys, pool.map(self._read, keys), strict=True):
                 self._keep(key, picture)
 
     def color(self, given: Image, *, is_radiance: bool = False, is_raw: bool = False) -> SceneNode:
-        """A texture of colours, up to 1 unless of radiance, or the fallback of a picture that cannot be read."""
+        """A texture of colours, up to 1 unless of radiance, or the fallback of an unreadable image."""
         if isinstance(given, TextureContents) and is_raw and given.color_space == "auto":
             given = replace(given, color_space="raw")
-        use, picture = self._used(given)
+        use, picture = self._image_of(given)
         most = None if is_radiance else 1.0
         if picture is None:
-            return {"type": "rgb", "value": np.clip(np.broadcast_to(_fallback(use), (3,)), 0, most).tolist()}
+            return {"type": "rgb", "value": np.clip(np.broadcast_to(fallback_of(use), (3,)), 0, most).tolist()}
         if isinstance(given, NodeContents):
             picture = replace(picture, pixels=np.clip(picture.pixels, 0, most))
         return self._bitmap(use, picture, is_raw=is_raw or use.channel != "rgb")
 
     def number(self, given: Image) -> SceneNode | float:
-        """A texture of numbers, or the fallback of a picture that cannot be read."""
-        use, picture = self._used(given)
+        """A texture of numbers, or the fallback of an unreadable image."""
+        use, picture = self._image_of(given)
         if picture is None:
-            return float(_fallback(use)[0])
+            return float(fallback_of(use)[0])
         return self._bitmap(replace(use, channel=use.channel[0]), picture, is_raw=True)
 
     def normals(self, given: Image) -> SceneNode | None:
-        """A texture of normals as Mitsuba has them, from 0 to 1; None if the picture cannot be read."""
-        use, picture = self._used(given)
+        """A texture of normals, from 0 to 1 as in Mitsuba; None for an unreadable image."""
+        use, picture = self._image_of(given)
         if picture is None:
             return None
         if picture.pixels.dtype == np.uint8 and use.scale[:2] == [1.0, 1.0] and use.bias[:2] == [0.0, 0.0]:
-            what = (
-                "normal maps of eight bits are normals from 0 to 1 as they are; expected a scale of 2 and a bias of -1"
-            )
-            self._notes.add(what, use.file)
+            expected = "expected a scale of 2 and a bias of -1"
+            self._notes.add(f"normal maps of eight bits are normals from 0 to 1 as they are; {expected}", use.file)
         scale, bias, fallback = (np.array([use.scale, use.bias, use.fallback]) + np.array([[0], [1], [1]])) / 2
         use = replace(use, scale=scale.tolist(), bias=bias.tolist(), fallback=fallback.tolist())
         return self._bitmap(use, picture, is_raw=True)
 
     def mean(self, given: Image) -> NDArray[np.float64]:
         """Mean of a texture's values, ``(k,)``."""
-        use, picture = self._used(given)
+        use, picture = self._image_of(given)
         if picture is None:
-            return _fallback(use)
+            return np.asarray(fallback_of(use), dtype=np.float64)
         return np.asarray(_values(picture, use).mean(axis=(0, 1), dtype=np.float64))
 
-    def _used(self, given: Image) -> tuple[TextureContents, TextureImage | None]:
-        """A texture and its picture, or None if that cannot be read; of an expression, its values, computed once."""
+    def _image_of(self, given: Image) -> tuple[TextureContents, TextureImage | None]:
+        """A texture and its image, None if unreadable; of an expression, its baked image."""
         if isinstance(given, TextureContents):
             return given, self._picture(given.file, given.color_space)
         if id(given) not in self._expressions:
@@ -108,9 +102,8 @@ class Textures:
                 self._notes.add(what, ", ".join(files))
                 values, to_uv, wrap = np.full((1, 1, 1), 0.5, np.float32), np.eye(3), "repeat"
             if values.shape[2] == 2:
-                # Red and green.
                 values = np.pad(values, ((0, 0), (0, 0), (0, 1)))
-            # Kept with the expression, so that no other has its identity.
+            # Keeps the expression alive, so that its identity is unique.
             self._expressions[id(given)] = given, TextureContents("", "rgb", "raw", wrap), TextureImage(values, to_uv)
         return self._expressions[id(given)][1:]
 
@@ -119,7 +112,7 @@ class Textures:
         return None if picture is None else (_values(picture, texture), picture.to_uv)
 
     def radiance(self, path: str, scale: NDArray) -> mi.Bitmap | None:
-        """Bitmap of a picture, linear and multiplied by a colour; None if it cannot be read."""
+        """Linear bitmap of an image, multiplied by a colour; None if it is unreadable."""
         picture = self._picture(path)
         if picture is None:
             return None
@@ -127,12 +120,12 @@ class Textures:
         return _linear_bitmap(values)
 
     def _bitmap(self, texture: TextureContents, picture: TextureImage, is_raw: bool) -> SceneNode:
-        """A texture of one picture, in eight bits if it has so many, as Mitsuba can keep them."""
+        """A texture of an image, in eight bits if possible."""
         pixels, channels = picture.pixels, texture.channels
         is_decoded = is_srgb_image(pixels, texture.color_space) and channels != [3]
         is_same = all(texture.scale[k] == 1 and texture.bias[k] == 0 for k in channels)
         key = texture.file, texture.channel, is_decoded
-        if pixels.dtype != np.uint8 or not is_same or picture.is_there is not None or (is_decoded and is_raw):
+        if pixels.dtype != np.uint8 or not is_same or picture.has_tile is not None or (is_decoded and is_raw):
             bitmap = _linear_bitmap(_values(picture, texture))
         else:
             if key not in self._bitmaps:
@@ -143,7 +136,7 @@ class Textures:
         return {"type": "bitmap", "bitmap": bitmap, "raw": is_raw, "wrap_mode": texture.wrap, "to_uv": to_uv}
 
     def _picture(self, path: str, color_space: str | None = None) -> TextureImage | None:
-        """A picture, with a colour space as fine as it is needed; None if it cannot be read."""
+        """An image, with a colour space as fine as needed; None if it is unreadable."""
         key = path, color_space
         if key not in self._pictures:
             self._keep(key, self._read(key))
@@ -151,9 +144,9 @@ class Textures:
 
     def _keep(self, key: tuple[str, str | None], picture: TextureImage | Exception) -> None:
         if isinstance(picture, Exception):
-            # Python's own text of a missing file repeats its path, with a number.
-            said = (isinstance(picture, OSError) and picture.strerror) or str(picture).strip()
-            reason = said.splitlines()[-1] if said else type(picture).__name__
+            # The text of OSError repeats the path.
+            text = (isinstance(picture, OSError) and picture.strerror) or str(picture).strip()
+            reason = text.splitlines()[-1] if text else type(picture).__name__
             self._notes.add("images that cannot be read are replaced by their fallback", f"{key[0]}: {reason}")
         self._pictures[key] = None if isinstance(picture, Exception) else picture
 
@@ -173,35 +166,32 @@ def _linear_bitmap(values: NDArray) -> mi.Bitmap:
     return bitmap
 
 
-def _fallback(texture: TextureContents) -> NDArray[np.float64]:
-    return np.asarray(texture.fallback)[texture.channels]
-
-
 def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float32]:
-    """``(h, w, k)`` linear values of the channels, scaled and moved; the fallback where there is no tile."""
+    """Linear values ``(h, w, k)`` of the channels, with scale and bias; the fallback where a tile is missing."""
     channels, is_srgb = texture.channels, is_srgb_image(picture.pixels, texture.color_space)
     values = linear_values(_selected(picture.pixels, channels), is_srgb, channels)
     numbers = np.array([texture.scale, texture.bias, texture.fallback], dtype=np.float32)
     scale, bias, fallback = numbers[:, channels]
     if (scale != 1).any() or (bias != 0).any():
         values = values * scale + bias
-    if picture.is_there is not None:
-        values[~picture.is_there] = fallback
+    if picture.has_tile is not None:
+        values[~picture.has_tile] = fallback
     return values
 
 
 def _selected(pixels: NDArray, channels: list[int]) -> NDArray:
-    """Channels of a picture; colour or alpha that it lacks are those of `with_alpha`."""
     first, end = channels[0], channels[-1] + 1
     if pixels.shape[2] >= max(3, end):
         return pixels[..., first:end]
     return pixels[..., :1] if len(channels) == 1 and first < 3 else with_alpha(pixels)[..., first:end]
 
 
-def baked(expression: NodeContents, picture_of: Callable[[TextureContents], Picture | None]) -> Baked:
-    """Values of an expression, with fallbacks of missing pictures.
+def baked(
+    expression: NodeContents, picture_of: Callable[[TextureContents], Picture | None]
+) -> tuple[NDArray[np.float32], NDArray[np.float64], str]:
+    """Image of an expression, and Mitsuba's wrap mode; with fallbacks of missing images.
 
-    If all pictures have one transform, at the resolution of the largest; else over the unit square, which repeats.
+    If all images have one transform, at the resolution of the largest; else over the unit square, which repeats.
     """
     sources = leaves(expression)
     textures = [source for source in sources if isinstance(source, TextureContents)]
@@ -217,7 +207,10 @@ def baked(expression: NodeContents, picture_of: Callable[[TextureContents], Pict
     for size, to_uv in zip(sizes, maps, strict=True):
         wanted.append(int(np.ceil(max(size) * np.linalg.norm(to_uv[:2, :2], axis=1).max())))
     edge = min(max(wanted, default=1), MOST)
-    wrap = "repeat" if textures else _procedural_wrap(expression)
+    # Ramps continue with their last value.
+    names = _categories(expression)
+    is_ramp = bool(names & _RAMPS) and not any("noise" in name or "fractal" in name for name in names)
+    wrap = "clamp" if is_ramp and not textures else "repeat"
     return _filled(expression, pictures, (edge, edge)), np.eye(3), wrap
 
 
@@ -225,9 +218,8 @@ def _filled(
     expression: NodeContents,
     pictures: Mapping[int, Picture | None],  # By the identity of the texture
     size: tuple[int, int],
-    shared: NDArray[np.float64] | None = None,  # To the part of the plane where all pictures lie; the unit square
+    shared: NDArray[np.float64] | None = None,  # Transform of all images; by default, the unit square
 ) -> NDArray[np.float32]:
-    """Values at the centres of all pixels, some rows at a time, as an expression has many arrays at once."""
     height, width = size
     u = (np.arange(width) + 0.5) / width
     to_uv = np.eye(2) if shared is None else shared[:2, :2]
@@ -256,7 +248,7 @@ def _filled(
         values = evaluate(expression, here, texels, gradient)
         return np.broadcast_to(values, (len(rows), width, values.shape[-1])).astype(np.float32)
 
-    # Slopes need the rows beside them.
+    # Slopes need neighbouring rows.
     count = height if "heighttonormal" in _categories(expression) else max(1, _PIXELS_AT_ONCE // width)
     starts = range(0, height, count)
     return np.concatenate([values_of(np.arange(first, min(first + count, height))) for first in starts])
@@ -267,23 +259,15 @@ def _categories(expression: NodeContents) -> set[str]:
 
 
 def samples_elsewhere(expression: NodeContents) -> bool:
-    """Whether an expression computes the texture coordinates of a picture."""
+    """Whether an expression computes the texture coordinates of an image."""
     return "image" in _categories(expression)
-
-
-def _procedural_wrap(expression: NodeContents) -> str:
-    """Only ramps do not repeat: they continue with their last value."""
-    names = _categories(expression)
-    is_noise = any("noise" in name or "fractal" in name for name in names)
-    return "clamp" if names & {"ramplr", "ramptb", "splitlr", "splittb"} and not is_noise else "repeat"
 
 
 def _looked_up(values: Values, uv: Values, wrap: str) -> Values:
     from scipy.ndimage import map_coordinates
 
     height, width = values.shape[:2]
-    # At least a row of places, also where all are one.
-    x, y = np.moveaxis(np.atleast_2d(uv), -1, 0)
+    x, y = np.moveaxis(np.atleast_2d(uv), -1, 0)  # `map_coordinates` needs an array of points
     places = (1 - y) * height - 0.5, x * width - 0.5
     modes: dict[str, Any] = {"repeat": "grid-wrap", "mirror": "reflect", "clamp": "nearest"}
     mode = modes[wrap]

@@ -9,7 +9,7 @@ from mitsuba_subdivision.cage import CageError
 from mitsuba_subdivision.regression.scene import load_scene
 from mitsuba_subdivision.studio.animation import StillPicture
 from mitsuba_subdivision.studio.picture import LEAST_LIGHTS
-from mitsuba_subdivision.studio.studio_entries import Environment, Look
+from mitsuba_subdivision.studio.studio_entries import Look
 from mitsuba_usd.stage_scenes import StageScenes
 from usd import stages
 from usd.stages import CUBE, POLYGONS, SQUARE, bound, mesh, moved, prim, told
@@ -101,7 +101,7 @@ def test_an_environment_is_a_dome_in_place_of_all_lights(tmp_path, axis):
     lit = stages.write(tmp_path, STILL + LAMP + glow, "lit.usda", up=axis)
     picture, turn = "asset inputs:texture:file = @sky.exr@\nfloat inputs:intensity = 3", moved(**{f"rotate{axis}": 40})
     own = stages.write(tmp_path, STILL + prim("DomeLight_1", "sky", picture, turn), "own.usda", up=axis)
-    look = Look(size=(24, 18), environment=Environment(tmp_path / "sky.exr", 40, 3))
+    look = Look(size=(24, 18), environment=tmp_path / "sky.exr", turn=40, strength=3)
     given, expected = (StillPicture(StageScenes(file, look, RATE)).scene for file in (lit, own))
     expected = msub.usd_scene(own, mi)
     assert {"lamp", "key_light", "ground"}.isdisjoint(given)
@@ -142,7 +142,7 @@ def test_cameras_by_name_intervals_of_shutters_and_frames_without_motion(tmp_pat
     for name in ("/rig/far", "far"):
         np.testing.assert_array_equal(rendered(path, "--camera", name), rendered(path, "--camera", "/rig/far"))
     assert command(path, "--camera", "near") == 1
-    assert 'there is no camera "near"; expected one of those there are: /camera, /rig/far' in capfd.readouterr().err
+    assert 'there is no camera "near"; expected one of /camera, /rig/far' in capfd.readouterr().err
     # The mean of both halves of the interval.
     blurred = rendered(path, "--time", "0.5", "--shutter", "-0.25:0.75:2")
     halves = [rendered(path, "--time", time, samples=8) for time in ("0.5", "1")]

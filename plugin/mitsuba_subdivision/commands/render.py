@@ -30,12 +30,12 @@ from ..regression.image import METADATA_ATTRIBUTE, save_image
 from ..regression.scene import BOX, LoadedScene, kept_search_folders, load_scene, render_image
 from ..regression.tiers import Tolerances
 from ..shapes.parameter_table import SHADINGS
-from ..studio import AOVS, DEFAULT_VIEW, Look, sampler, variant_in_use
-from ..studio.animation import FrameRange, StillPicture, Turntable
+from ..studio import AOVS, DEFAULT_VIEW, Look, sampler
+from ..studio.animation import FrameRange, SceneSource, StillPicture, Turntable
 from ..studio.cage_scenes import CageScenes
 from ..studio.picture import denoised, require_denoiser, shading_for, weigh_lights
 from ..studio.saving import save_scene
-from ..studio.studio_entries import LENGTHS, UP_AXES, VIEWS, Environment
+from ..studio.studio_entries import LENGTHS, UP_AXES, VIEWS
 from ..variants import set_variant, threads_set, variant_problem
 from ..whole_file import require_writable, whole_file
 from .arguments import CommandParser, above_zero, add_cage_options, add_variant, checked, finite, index, positive, seed
@@ -49,10 +49,12 @@ _OF_ONE_MESH = ("up", "scheme", "prim", "checker", "cage")
 _OF_STAGES = ("shutter", "texture_size", "camera", "over")
 _OF_SCENES = ("parameters", "sensor", "share", "reference", "tolerances")  # Options about scenes in files
 # Options that `Look` has by the same names.
-_OF_LOOK = ("up", "size", "spp", "rate", "checker", "cage", "texture_size", "environment", "transparent", "aovs")
+_OF_LOOK = ("up", "size", "spp", "rate", "checker", "cage", "texture_size", "transparent", "aovs")
 # Suffixes of files that Blender converts to USD files.
 _OF_BLENDER = (".blend", ".fbx", ".gltf", ".glb", ".abc", ".dae", ".stl", ".3ds")
 SUB_FRAMES = 16  # In an interval
+_Animation = FrameRange | Turntable | StillPicture
+_Shown = tuple[_Animation, SceneSource[Any]]
 _WITH_ALPHA = (".exr", ".png")
 EVEN = 2  # Sides of the pictures in an MP4 file are multiples of this; others lose a row or a column
 
@@ -81,9 +83,10 @@ def _shutter_of(text: str) -> tuple[int, tuple[float, float] | None]:
     return count, None if len(numbers) == 1 else (float(numbers[0]), float(numbers[1]))
 
 
-def _environment_of(text: str) -> Environment:
+def _environment_of(text: str) -> dict[str, Any]:
+    """Values of `Look` for an environment."""
     path, turn, strength = re.fullmatch(r"(.+?)(?:,turn=([^,]*))?(?:,strength=([^,]*))?", text).groups()  # type: ignore[union-attr]
-    return Environment(Path(path), float(turn or 0), float(strength or 1))
+    return {"environment": Path(path), "turn": float(turn or 0), "strength": float(strength or 1)}
 
 
 _shutter = checked(
@@ -93,7 +96,7 @@ _shutter = checked(
 )
 _environment = checked(
     _environment_of,
-    lambda given: isfinite(given.turn) and 0 <= given.strength < inf,
+    lambda given: isfinite(given["turn"]) and 0 <= given["strength"] < inf,
     "a picture, such as sky.exr or sky.exr,turn=90,strength=2",
 )
 _aovs = checked(
@@ -276,8 +279,8 @@ def _refuse_contradictions(options: argparse.Namespace, by_passes: bool) -> None
         raise ValueError(f"--transparent is for pictures; expected no {all_options} beside it")
     if options.transparent and suffix not in _WITH_ALPHA:
         raise ValueError(f'output "{options.output}" has no alpha; expected one ending in {" or ".join(_WITH_ALPHA)}')
-    if options.environment and not options.environment.path.is_file():
-        raise FileNotFoundError(f'"{options.environment.path}": there is no such file; expected a picture')
+    if options.environment and not options.environment["environment"].is_file():
+        raise FileNotFoundError(f'"{options.environment["environment"]}": there is no such file; expected a picture')
     known = (*IMAGE_SUFFIXES, *(VIDEO_SUFFIXES if has_frames else ()))
     if suffix not in known:
         more = ", or --turntable or --frames for a video" if suffix in VIDEO_SUFFIXES else ""
@@ -373,7 +376,10 @@ def _bitmap(image: NDArray[np.float32], channels: list[str], *, in_8_bits: bool)
 
 
 def _render_picture(
-    options: argparse.Namespace, scenes: Iterable[LoadedScene], spp: int | None = None, source: Any = None
+    options: argparse.Namespace,
+    scenes: Iterable[LoadedScene],
+    spp: int | None = None,
+    source: SceneSource[Any] | None = None,
 ) -> Picture:
     """Mean picture of scenes that share no samples: one, or those of a frame's sub-frames."""
     count, _ = options.shutter or (1, None)
@@ -474,16 +480,16 @@ def _frame(command: bytes, number: int) -> tuple[Picture, list[str]]:
 
 
 @lru_cache(maxsize=1)
-def _kept(command: bytes) -> tuple[argparse.Namespace, tuple[FrameRange | Turntable | StillPicture, Any]]:
+def _kept(command: bytes) -> tuple[argparse.Namespace, _Shown]:
     """Options and what they show: a worker reads it once for all of its frames."""
     options = argparse.Namespace(**pickle.loads(command))
     return options, _shown(options)
 
 
-def _shown(options: argparse.Namespace) -> tuple[FrameRange | Turntable | StillPicture, Any]:
+def _shown(options: argparse.Namespace) -> _Shown:
     """What a model's pictures show, and the scene source."""
     source = _source(options)
-    shown: FrameRange | Turntable | StillPicture
+    shown: _Animation
     if options.frames or options.shutter:
         shown = FrameRange(source, options.frames or range(1, 2))
     elif options.turntable:
@@ -497,7 +503,7 @@ def _shown(options: argparse.Namespace) -> tuple[FrameRange | Turntable | StillP
     return shown, source
 
 
-def _source(options: argparse.Namespace) -> Any:
+def _source(options: argparse.Namespace) -> SceneSource[Any]:
     azimuth, elevation = VIEWS[options.view or DEFAULT_VIEW]
     azimuth = azimuth if options.azimuth is None else options.azimuth
     elevation = elevation if options.elevation is None else options.elevation
@@ -506,6 +512,7 @@ def _source(options: argparse.Namespace) -> Any:
         has_studio=not options.no_studio,
         scales=True,
         **{"aovs": {}, **{name: value for name in _OF_LOOK if (value := getattr(options, name)) is not None}},
+        **(options.environment or {}),
     )
     which = {"time": options.time, "numbers": options.frames}
     if _is_stage(options):
@@ -520,7 +527,7 @@ def _source(options: argparse.Namespace) -> Any:
         if getattr(options, name):
             flag = f"--{name.replace('_', '-')}"
             raise ValueError(f'{flag} was given for one cage of "{options.scene}"; expected it for a whole USD file')
-    shading = shading_for(variant_in_use(), {"shading": options.shading or "auto"})
+    shading = shading_for({"shading": options.shading or "auto"})
     return CageScenes(options.scene, replace(look, shading=shading), prim=options.prim, scheme=options.scheme, **which)
 
 

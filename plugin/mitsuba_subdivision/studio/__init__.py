@@ -2,7 +2,7 @@
 
 from ..regression.scene import LoadedScene
 from ..tessellation import HIGHEST_RATE
-from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
+from .animation import SceneSource, StillPicture, load_quietly, set_parameters
 from .cage_scenes import frame_table, studio_scene
 from .picture import (
     ERRORS,
@@ -34,36 +34,9 @@ from .studio_entries import (
 )
 
 __all__ = [
-    "AOVS",
-    "DEFAULT_SIZE",
-    "DEFAULT_SPP",
-    "DEFAULT_VIEW",
-    "ENVIRONMENT",
-    "ERRORS",
-    "HIGHEST_RATE",
-    "MOST_SEGMENTS",
-    "MOST_TRIANGLES",
-    "STUDIO",
-    "FrameFiles",
-    "LoadedScene",
-    "Look",
-    "StillPicture",
-    "View",
-    "enlargement",
-    "finished",
-    "frame_table",
-    "highest_rate",
-    "load_quietly",
-    "outline_for",
-    "pixels_of_boxes",
-    "render_denoised",
-    "sampler",
-    "segments_for",
-    "set_parameters",
-    "shading_for",
-    "studio",
-    "studio_scene",
-    "triangles_for",
-    "variant_in_use",
+    "AOVS", "DEFAULT_SIZE", "DEFAULT_SPP", "DEFAULT_VIEW", "ENVIRONMENT", "ERRORS", "HIGHEST_RATE", "MOST_SEGMENTS",
+    "MOST_TRIANGLES", "STUDIO", "LoadedScene", "Look", "SceneSource", "StillPicture", "View", "enlargement", "finished",
+    "frame_table", "highest_rate", "load_quietly", "outline_for", "pixels_of_boxes", "render_denoised", "sampler",
+    "segments_for", "set_parameters", "shading_for", "studio", "studio_scene", "triangles_for", "variant_in_use",
     "weigh_lights",
-]
+]  # fmt: skip

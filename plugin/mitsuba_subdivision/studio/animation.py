@@ -1,18 +1,18 @@
 """A still picture, a turntable and a range of frames of a scene source, for the command ``render``.
 
 Each has ``scene``, the entries of its first frame, and ``frames``, which loads the scenes of some frames, one after the
-other. A scene source builds scenes from contents at a time: `CageScenes` of one cage, or `StageScenes` of a whole USD
-file, which has the same methods.
+other.
 """
 
 from __future__ import annotations
 
 import re
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import mitsuba as mi
 import numpy as np
@@ -23,15 +23,93 @@ from ..device_arrays import upload
 from ..mitsuba_mesh import points_at, with_meshes
 from ..regression.scene import LoadedScene, load_scene
 from ..variants import SceneNode
-from .studio_entries import RIG, outermost, studio_axes, turned
+from .studio_entries import RIG, Look, View, outermost, studio_axes, turned
 
 PATTERN = re.compile(r"%(0\d+)?d")
+Contents = TypeVar("Contents")
+
+
+class SceneSource(ABC, Generic[Contents]):
+    """Scenes of a model, from its contents in a frame: `CageScenes` of one cage, or `StageScenes` of a USD file.
+
+    Raises CageError if frames are neither times of a USD file nor numbered files. Raises FileNotFoundError if there is
+    no file for a frame.
+    """
+
+    factor: float | None = None  # By which the scene is larger than the model; None before points are known
+
+    def __init__(
+        self,
+        model: object,  # A file; for frames also a name with a number in it, such as "frame_%04d.obj"; or a cage
+        name: str,  # With which messages begin
+        look: Look,
+        time: float | None,
+        numbers: range | None,  # Times or numbers of files, if there are frames
+    ) -> None:
+        self.name, self.numbers, self._look, self._time, self._path = name, numbers, look, time, Path(str(model))
+        # Types of AOVs by the names of their channels, and names of AOVs by render products.
+        self.aovs, self.products = look.aovs or {}, dict[str, list[str]]()
+        self._has_files = numbers is not None and bool(PATTERN.search(self._path.name))
+        if numbers is None:
+            return
+        if not self._has_files and not self._path.suffix.lower().startswith(".usd"):
+            expected = "a name such as frame_%04d.obj"
+            raise CageError(f'"{model}": frames are times of a USD file, or files; expected {expected}')
+        missing = [file for number in numbers if not (file := self._file_and_time(number)[0]).is_file()]
+        if missing:
+            more = f" ({len(missing)} such files)" if len(missing) > 1 and self._has_files else ""
+            raise FileNotFoundError(f'"{missing[0]}": there is no such file{more}; expected one for each frame')
+
+    def _file_and_time(self, number: int | None) -> tuple[Path, float | None]:
+        """File and time code of a frame, or of the still picture."""
+        if number is None or self.numbers is None:
+            return self._path, self._time
+        if not self._has_files:
+            return self._path, float(number)
+        return self._path.with_name(PATTERN.sub(lambda match: match[0] % number, self._path.name, count=1)), None
+
+    @abstractmethod
+    def at(self, number: int | None = None) -> Contents:
+        """Contents of a frame, or of the still picture."""
+
+    @abstractmethod
+    def framing(self, contents: Contents) -> tuple[str, View, tuple[int, int]]:
+        """Axis that points up, view and size of the picture."""
+
+    @abstractmethod
+    def points(self, contents: Contents) -> NDArray[np.float64]:
+        """Points ``(n, 3)`` in the world that the studio's camera must see."""
+
+    @abstractmethod
+    def scene(
+        self,
+        contents: Contents,
+        points: NDArray[np.float64] | None = None,  # (n, 3): of all frames; by default, of the contents
+        *,
+        follows_sensor: bool = False,  # Whether triangles may depend on the sensor, as no other one renders the scene
+        turns: Sequence[NDArray[np.float64]] = (),  # (4, 4) each: of that sensor in all pictures, if it moves
+    ) -> SceneNode:
+        """Entries of a scene."""
+
+    @abstractmethod
+    def frames(
+        self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
+    ) -> Iterator[LoadedScene]:
+        """Loaded scenes of some frames, and of all their sub-frames if there is a shutter."""
+
+    def has_studio(self, contents: Contents) -> bool:  # noqa: ARG002 - of cages, always
+        """Whether the camera or the lights are those of the studio, which depend on the points."""
+        return True
+
+    def remarks(self) -> list[str]:
+        """Remarks on the pictures for standard error."""
+        return []
 
 
 class StillPicture:
     """One picture of a source. If only the scene's own sensor renders it, triangles may depend on the sensor."""
 
-    def __init__(self, source: Any, *, follows_sensor: bool = True) -> None:
+    def __init__(self, source: SceneSource[Any], *, follows_sensor: bool = True) -> None:
         self.scene: SceneNode = source.scene(source.at(), follows_sensor=follows_sensor)
 
     def frames(self, numbers: Sequence[int], filter_name: str | None) -> Iterator[LoadedScene]:
@@ -42,11 +120,11 @@ class Turntable:
     """A cage or a stage that turns once, in frames 1 to ``count``, around the middle of its bounds.
 
     In Mitsuba the model stands still: the camera turns around it the other way, with the lights and the backdrop of the
-    studio. The studio's camera sees all of it in all frames. Frame 1 is the still picture; in the next ones, what is
-    shown is turned counter-clockwise, seen from above, with its own lights.
+    studio. The studio's camera sees the whole model in all frames. Frame 1 is the still picture; in later frames, the
+    model and its own lights are turned counter-clockwise, seen from above.
     """
 
-    def __init__(self, source: Any, count: int, *, follows_sensor: bool = True) -> None:
+    def __init__(self, source: SceneSource[Any], count: int, *, follows_sensor: bool = True) -> None:
         self._count, contents = count, source.at()
         points, framing = source.points(contents), source.framing(contents)
         self._axes = studio_axes(framing[0])
@@ -86,7 +164,7 @@ class FrameRange:
     Raises CageError, OSError if a frame cannot be read, or nothing is visible in any of them.
     """
 
-    def __init__(self, source: Any, numbers: range) -> None:
+    def __init__(self, source: SceneSource[Any], numbers: range) -> None:
         self.numbers, self._source = numbers, source
         contents = source.at(numbers[0])
         framing, self._points = source.framing(contents), source.points(contents)
@@ -119,36 +197,3 @@ def set_parameters(part: mi.Object, values: Mapping[str, Any]) -> None:
         kind = type(parameters[name])
         parameters[name] = upload(kind, value) if isinstance(value, np.ndarray) else kind(value)
     parameters.update()
-
-
-class FrameFiles:
-    """File and time code of a frame.
-
-    Raises CageError if the name has no number in it. Raises FileNotFoundError if there is no file for a frame.
-    """
-
-    def __init__(
-        self,
-        path: Path,  # A USD file, or a name with a number in it, such as "frame_%04d.obj"
-        numbers: range,  # Times or numbers of files
-    ) -> None:
-        self._path, self.numbers = path, numbers
-        self.are_many = bool(PATTERN.search(path.name))
-        if not self.are_many and not path.suffix.lower().startswith(".usd"):
-            raise CageError(
-                f'"{path}": frames are times of a USD file, or files; expected a name such as frame_%04d.obj'
-            )
-        missing = [file for number in numbers if not (file := self.file(number)).is_file()]
-        if missing:
-            more = f" ({len(missing)} such files)" if len(missing) > 1 and self.are_many else ""
-            raise FileNotFoundError(f'"{missing[0]}": there is no such file{more}; expected one for each frame')
-
-    def file(self, number: int) -> Path:
-        """File of a frame."""
-        if not self.are_many:
-            return self._path
-        return self._path.with_name(PATTERN.sub(lambda match: match[0] % number, self._path.name, count=1))
-
-    def time(self, number: int) -> float | None:
-        """Time code of a frame; None in files of their own."""
-        return None if self.are_many else float(number)

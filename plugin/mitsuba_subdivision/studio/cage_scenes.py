@@ -23,38 +23,24 @@ from ..shapes.cage_attributes import mesh_name
 from ..surface import LimitSurface
 from ..tessellation.vertex_table import VertexTable
 from ..variants import SceneNode
-from .animation import FrameFiles, StillPicture, load_quietly, set_parameters
+from .animation import SceneSource, StillPicture, load_quietly, set_parameters
 from .obj_materials import Material, material_bsdf, material_emitter, read_materials
 from .picture import MOST_SEGMENTS, highest_rate, outline_for, segments_for, shading_for, triangles_for
-from .studio_entries import (
-    DEFAULT_SIZE,
-    DEFAULT_SPP,
-    DEFAULT_VIEW,
-    Look,
-    View,
-    enlargement,
-    finished,
-    studio,
-    variant_in_use,
-)
+from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, DEFAULT_VIEW, Look, View, enlargement, finished, studio
 
 CLAY = (0.56, 0.52, 0.47)
 CHECKER = (0.15, 0.23, 0.32), (0.72, 0.68, 0.61)
-# Squares along a texture coordinate from 0 to 1.
-CHECKER_SQUARES = 16
-# Attributes that are shown in place of clay: of PLY files, and of USD's meshes.
+CHECKER_SQUARES = 16  # Squares along a texture coordinate from 0 to 1
+# Attributes that replace the colour of clay: of PLY files, and of USD's meshes.
 COLOURS = ("color", "displayColor")
-WIRE_COLOUR = (0.015, 0.05, 0.12)
-WIRE_RATE = 2
-# Radius of the rods, in radii of the model, and at most in lengths of the middle edge. Balls are thicker.
+WIRE_COLOUR, WIRE_RATE = (0.015, 0.05, 0.12), 2
+# Radius of the rods, in radii of the model; its maximum, in lengths of the median edge; and radius of balls, in rods.
 ROD, ROD_PER_EDGE, BALL = 0.0045, 0.05, 2.2
-# Square tubes and cubes have round limit surfaces, which lie so far within them: of the distance of a corner.
+# Radius of the round limit surfaces of square tubes and cubes, in distances of a corner.
 _TUBE_LIMIT, _CUBE_LIMIT = 2 / 3, 1 / 2
-# Quadrilaterals of a tessellation: enough for a picture of usual size. Coarse cages have no more segments per edge than
-# the picture shows.
-QUADS = 200_000
-HIGHEST_DEFAULT_RATE = 24
-# Segments per edge between which a camera's frame may be missed, by far less than its margin; of large cages 1.
+# Quadrilaterals of a tessellation for a picture of usual size, and its highest rate.
+QUADS, HIGHEST_DEFAULT_RATE = 200_000, 24
+# Rate of points that a camera frames, which misses far less than the margin; and faces of cages with a rate of 1.
 FRAME_RATE, LARGE = 4, 20_000
 
 
@@ -70,17 +56,16 @@ class Model:
         self,
         cage: ControlCage,
         path: Path | None = None,  # Its file; None for a cage in memory
-        **chosen: Any,  # What of the file: `prim`, `time` and `scheme` as for `ControlCage.from_file`
+        **chosen: Any,  # `prim`, `time` and `scheme` as for `ControlCage.from_file`
     ) -> None:
         self.path, self.chosen = path, {name: value for name, value in chosen.items() if value is not None}
         self.cage, self.surface = cage, LimitSurface(cage, self.chosen.get("scheme"))
 
     @cached_property
     def materials(self) -> dict[str, Material]:
-        """Materials that the libraries of an OBJ file describe, by name."""
-        is_obj = self.path is not None and self.path.suffix.lower() == ".obj"
+        """Materials in the libraries of an OBJ file, by name."""
         by_face = self.surface.scheme.element == "face" or len(self.cage.materials) == 1
-        if not (self.path and is_obj and self.cage.materials and by_face):
+        if self.path is None or self.path.suffix.lower() != ".obj" or not (self.cage.materials and by_face):
             return {}
         described = read_materials(self.path)
         missing = ", ".join(f'"{name}"' for name in self.cage.materials if name and name not in described)
@@ -90,17 +75,15 @@ class Model:
 
     @cached_property
     def up(self) -> str:
-        """Axis that points up, "y" or "z", by its file; z for cages that are not from a file."""
+        """Axis that points up, "y" or "z", of the file; z for cages in memory."""
         return "z" if self.path is None else FORMATS[self.path.suffix.lower()].up or stage_up_axis(self.path)
 
     @property
     def default_rate(self) -> int:
-        """Segments per edge that are enough for a picture."""
+        """Segments per edge for a picture of usual size."""
         return max(2, min(HIGHEST_DEFAULT_RATE, isqrt(QUADS // self.cage.face_count)))
 
-    @cached_property
-    def _frame_table(self) -> VertexTable:
-        return frame_table(self.surface)
+    _frame_table = cached_property(lambda self: frame_table(self.surface))
 
     def limit_points(self, control_points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points ``(n, 3)`` all over the limit surface of these control points."""
@@ -132,8 +115,7 @@ class Model:
         """Control points of the rods and balls, from the control points ``(n, 3)`` of the cage."""
         ends, radius = control_points[self.cage.edges], self.wire_radius
         along = _unit(ends[:, 1] - ends[:, 0])
-        # The axis that is furthest from the edge.
-        axis = np.eye(3)[np.abs(along).argmin(axis=1)]
+        axis = np.eye(3)[np.abs(along).argmin(axis=1)]  # The axis that is furthest from the edge
         side = _unit(np.cross(along, axis))
         across = np.stack([side, np.cross(along, side)], axis=1)
         ring = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]]) @ across * (radius / _TUBE_LIMIT)
@@ -143,7 +125,7 @@ class Model:
         return np.concatenate([tubes.reshape(-1, 3), balls.reshape(-1, 3)])
 
     def triangles_for(self, sensor: SceneNode, factor: float = 1.0) -> SceneNode:
-        """Parameters of the coarsest exactly shaded tessellation whose facets this sensor of a scene does not see."""
+        """Parameters of the coarsest exactly shaded tessellation without visible facets for a sensor."""
         outline, corners = outline_for(sensor), int(self.cage.face_sizes.sum())
         to_world = np.diag([factor, factor, factor, 1.0])[None]
         segments = segments_for(self.cage, to_world, outline, sensor["near_clip"], "exact")
@@ -156,23 +138,19 @@ def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return vectors / np.where(lengths > 0, lengths, 1)
 
 
-# A model with control points of a frame, ``(n, 3)`` float64.
-PosedModel = tuple[Model, NDArray[np.float64]]
+PosedModel = tuple[Model, NDArray[np.float64]]  # Model and control points (n, 3) of a frame
 
 
-class CageScenes:
-    """Scene source of one cage in the studio: its contents at a time, and scenes of these.
+class CageScenes(SceneSource[PosedModel]):
+    """Scenes of one cage in the studio.
 
-    Where frames have the same topology, the shape that is loaded gets other control points; its patches and weights
-    stay.
+    Where frames have the same topology, the loaded shape gets other control points, and keeps its patches and weights.
 
     Raises CageError, OSError if there is no file of a frame.
     """
 
     def __init__(
         self,
-        # A cage, or the file of one. For frames, a USD file, or a name with a number in it, such as
-        # "frame_%04d.obj".
         cage: ControlCage | str | Path,
         look: Look,
         *,
@@ -180,32 +158,23 @@ class CageScenes:
         prim: str | None = None,
         time: float | None = None,
         scheme: str | None = None,
-        numbers: range | None = None,  # Times or numbers of files, if there are frames
+        numbers: range | None = None,
     ) -> None:
-        self.name = cage.source.name if isinstance(cage, ControlCage) else f'"{cage}"'
+        name = cage.source.name if isinstance(cage, ControlCage) else f'"{cage}"'
         if isinstance(cage, ControlCage) and (prim is not None or time is not None):
-            raise CageError(f"{self.name}: prim or time was given; expected them for a file")
-        self._cage, self._look = cage, look
-        # As all sources have them: types of AOVs, and the AOVs of render products.
-        self.aovs, self.products = look.aovs or {}, dict[str, list[str]]()
-        self._prim, self._time, self._scheme = prim, time, scheme
+            raise CageError(f"{name}: prim or time was given; expected them for a file")
+        super().__init__(cage, name, look, time, numbers)
+        self._cage, self._prim, self._scheme = cage, prim, scheme
         self._rules = {"scheme": scheme} if scheme else {}
-        self._files = None if numbers is None else FrameFiles(Path(str(cage)), numbers)
-        # Contents and model of the first frame that is read.
-        self._first: Any = None
-        # By which the scene is larger than the cage.
-        self.factor: float | None = None
+        self._first: Any = None  # Contents and model of the first frame that is read
         # Frames whose warnings were printed: all are read once for the camera, and again when they are rendered.
         self._seen: set[int | None] = set()
 
     def at(self, number: int | None = None) -> PosedModel:
-        """The cage of a frame; by default, of the file or in memory."""
         if isinstance(self._cage, ControlCage):
             model = Model(self._cage, scheme=self._scheme)
             return model, model.cage.positions
-        path, time = Path(self._cage), self._time
-        if self._files is not None and number is not None:
-            path, time = self._files.file(number), self._files.time(number)
+        path, time = self._file_and_time(number)
         with without_warnings(), noting_warnings() as noted:
             contents = read_file(path, self._prim, time, self._rules)
             if self._first is not None and same_topology(contents, self._first[0]):
@@ -220,11 +189,9 @@ class CageScenes:
         return model, cage.positions
 
     def framing(self, contents: PosedModel) -> tuple[str, View, tuple[int, int]]:
-        """Axis that points up, view and size of the picture."""
         return self._look.up or contents[0].up, self._look.view, self._look.size or DEFAULT_SIZE
 
     def points(self, contents: PosedModel) -> NDArray[np.float64]:
-        """Points ``(n, 3)`` in the world that the camera must see: the limit surface, and the cage if it is drawn."""
         model, positions = contents
         points = model.points if positions is model.cage.positions else model.limit_points(positions)
         points = np.concatenate([points, model.wire_points(positions)]) if self._look.cage else points
@@ -232,26 +199,15 @@ class CageScenes:
             self.factor = enlargement(np.ptp(points, axis=0).max()) if self._look.scales else 1.0
         return self.factor * points
 
-    def has_studio(self, contents: PosedModel) -> bool:  # noqa: ARG002 - as all sources have it
-        """Whether the camera or the lights are those of the studio, which depend on the points: of a cage they are."""
-        return True
-
-    def remarks(self) -> list[str]:
-        """What is to be said of the pictures, as all sources have it: of a cage, nothing."""
-        return []
-
     def scene(
         self,
         contents: PosedModel,
-        # (n, 3): points that the camera must see in all frames; by default, the points of the contents
         points: NDArray[np.float64] | None = None,
         *,
-        # Whether only the scene's own sensor renders it, so that triangles may depend on the sensor
         follows_sensor: bool = False,
-        # (4, 4) each: of the scene's own sensor in all pictures of the scene, if it moves and no other one renders it
         turns: Sequence[NDArray[np.float64]] = (),  # noqa: ARG002
     ) -> SceneNode:
-        """Entries of a scene: "surface", "cage" if it is drawn, and those of the studio.
+        """Entries "surface", "cage" if it is drawn, and those of the studio.
 
         Raises CageError if ``checker`` is set, and there are no texture coordinates.
         """
@@ -270,10 +226,7 @@ class CageScenes:
     def frames(
         self, numbers: Sequence[int], points: NDArray[np.float64], filter_name: str | None
     ) -> Iterator[LoadedScene]:
-        """The scenes of some frames; frames with the first frame's topology share one loaded scene.
-
-        Where the camera has a shutter, which a cage has not, each frame has as many scenes as sub-frames.
-        """
+        """Loaded scenes; frames with the first frame's topology share one."""
         first = self._first[1]
         scene = self.scene((first, first.cage.positions), points)
         shared: LoadedScene | None = None
@@ -291,11 +244,9 @@ class CageScenes:
             yield shared
 
     def _shapes(self, model: Model, triangles: SceneNode | None = None, *, in_memory: bool = False) -> SceneNode:
-        """Entries of the limit surface and of the drawn cage."""
         look = self._look
         if in_memory or model.path is None:
-            # What `prim` and `time` have chosen is in the cage itself.
-            cage = model.cage.as_properties(mi) | self._rules
+            cage = model.cage.as_properties(mi) | self._rules  # The cage is that of `prim` at `time`
         else:
             cage = {"filename": str(model.path.resolve()), **model.chosen}
         triangles = triangles or {"tessellation_rate": look.rate or model.default_rate}
@@ -313,12 +264,11 @@ class CageScenes:
 
 
 def _in_materials(model: Model, surface: SceneNode, in_memory: bool) -> SceneNode:
-    """A shape for each material of a cage: "surface", "surface_2" and so on. All have the same vertices."""
+    """Shapes for the materials of a cage, "surface", "surface_2" and so on, with the same vertices."""
     shapes: SceneNode = {}
     if not model.materials:
         return shapes
-    # Any, as the stubs call it an object.
-    tensor: Any = mi.TensorXu
+    tensor: Any = mi.TensorXu  # The stubs call it an object
     for name, faces in model.cage.materials.items():
         material = model.materials.get(name)
         shown = {"shown_faces": tensor(faces.astype(np.uint32))} if in_memory else {"material": name}
@@ -333,7 +283,6 @@ def _in_materials(model: Model, surface: SceneNode, in_memory: bool) -> SceneNod
 
 
 def _material(cage: ControlCage, checker: bool = False) -> SceneNode:
-    """A checkerboard, or the colours at the vertices of a cage, or clay."""
     attributes = cage.attributes
     shown = next((name for name in COLOURS if name in attributes and attributes[name].values.shape[1] == 3), None)
     colour: SceneNode = {"type": "rgb", "value": list(CLAY)}
@@ -347,8 +296,7 @@ def _material(cage: ControlCage, checker: bool = False) -> SceneNode:
             "to_uv": mi.ScalarTransform4f().scale([CHECKER_SQUARES / 2, CHECKER_SQUARES / 2, 1]),
         }
     clay = {"type": "principled", "base_color": colour, "roughness": 0.42, "specular": 0.5}
-    # Open surfaces are seen from both sides.
-    return {"type": "twosided", "bsdf": clay}
+    return {"type": "twosided", "bsdf": clay}  # Open surfaces are seen from both sides
 
 
 def studio_scene(
@@ -404,6 +352,5 @@ def studio_scene(
     ValueError
         If the view, the axis or the size is invalid.
     """
-    shading = shading_for(variant_in_use(), {"shading": shading})
-    look = Look(view, size, spp, up, rate, shading, checker, cage)
+    look = Look(view, size, spp, up, rate, shading_for({"shading": shading}), checker, cage)
     return StillPicture(CageScenes(model, look, prim=prim, time=time, scheme=scheme)).scene

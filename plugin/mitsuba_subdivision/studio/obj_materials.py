@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import mitsuba as mi
@@ -13,13 +12,12 @@ import numpy as np
 from ..cage.errors import shortened, warn
 from ..variants import SceneNode
 
-# Entries that become something, with the number of their values; the first of "d" and "Tr" in a material counts.
+# Entries of numbers, and how many; the first of "d" and "Tr" in a material counts.
 _NUMBERS = {"Kd": 3, "Ks": 3, "Ke": 3, "Ns": 1, "d": 1, "Tr": 1, "illum": 1, "Pr": 1, "Pm": 1}
 _TEXTURE = "map_Kd"
 # Entries about ambient light, and the index of refraction, in whose place Ks gives the strength of highlights.
 _WITHOUT_EFFECT = ("Ka", "map_Ka", "Ni")
-# Models of the entry "illum" without highlights.
-_MATTE = (0, 1)
+_MATTE = (0, 1)  # Models of the entry "illum" without highlights
 
 # Options of a map, with the number of their values; of the last three, all but the first value may be missing.
 _OPTIONS = {
@@ -27,53 +25,15 @@ _OPTIONS = {
     "-mm": 2,
     **dict.fromkeys(("-o", "-s", "-t"), 3),
 }
-# Those that a picture of colours does not need: strengths of bumps, sharpness of small pictures and their size.
+# Options without effect on colours: strengths of bumps, sharpness and size of small pictures.
 _OPTIONS_WITHOUT_EFFECT = ("-bm", "-boost", "-cc", "-texres")
 _EXPECTED = "Kd, map_Kd (with -s, -o, -mm, -clamp, -blendu and -blendv), Ks, Ns, Ke, d, Tr, illum, Pr and Pm"
-
-
-@dataclass
-class Picture:
-    """A picture that is mapped onto a surface."""
-
-    path: Path
-    # The picture is looked up at ``scale * uv + offset``
-    scale: list[float] = field(default_factory=lambda: [1.0, 1.0, 1.0])
-    offset: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    # Its linear values ``c`` become ``base + gain * c``
-    base: float = 0.0
-    gain: float = 1.0
-    is_clamped: bool = False  # Whether it is continued by its edges, rather than repeated
-    is_blended: bool = True  # Whether pixels are interpolated
-
-    def texture(self) -> SceneNode:
-        """The picture as a texture of Mitsuba."""
-        # OBJ's v points up, a bitmap's down.
-        to_uv = mi.ScalarTransform4f().translate([0, 1, 0]).scale([1, -1, 1])
-        to_uv = to_uv.translate([*self.offset[:2], 0]).scale([*self.scale[:2], 1])
-        picture: SceneNode = {"filename": str(self.path.resolve())}
-        if (self.base, self.gain) != (0, 1):
-            form = mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32
-            bitmap = mi.Bitmap(str(self.path)).convert(*form, srgb_gamma=False)
-            values = np.clip(self.base + self.gain * np.array(bitmap), 0, 1)
-            picture = {"bitmap": mi.Bitmap(values.astype(np.float32))}
-        return {
-            "type": "bitmap",
-            **picture,
-            "to_uv": to_uv,
-            "wrap_mode": "clamp" if self.is_clamped else "repeat",
-            "filter_type": "bilinear" if self.is_blended else "nearest",
-        }
-
-
-Material = dict[str, list[float] | Picture]
+# Numbers of entries, and the texture of ``map_Kd``.
+Material = dict[str, list[float] | SceneNode]
 
 
 def read_materials(path: Path) -> dict[str, Material]:
-    """Materials of an OBJ file by name; none if it names no library, or no library can be read.
-
-    Warns if there is no such library, or entries are left out.
-    """
+    """Materials of an OBJ file by name. Warns if there is no such library, or entries are left out."""
     content = path.read_bytes()
     materials: dict[str, Material] = {}
     for names in re.findall(rb"^[ \t]*mtllib[ \t]+(.+?)\s*$", content, re.MULTILINE):
@@ -88,7 +48,7 @@ def read_materials(path: Path) -> dict[str, Material]:
 
 
 def _libraries(folder: Path, names: str) -> list[Path]:
-    """Files that a statement ``mtllib`` names: one whose name may have spaces, or several that end in ".mtl"."""
+    """Files of a statement ``mtllib``: one whose name may have spaces, or several that end in ".mtl"."""
     names = _without_comment(names)
     whole = _file(folder, names)
     if whole.is_file():
@@ -101,7 +61,7 @@ def _file(folder: Path, name: str) -> Path:
 
 
 def _without_comment(line: str) -> str:
-    """A line without its comment; a name may have a "#" in it, but for one between spaces."""
+    """A line without its comment, which begins with "#" at the start or between spaces."""
     return re.sub(r"(^#|\s#(?=\s|$)).*", "", line.strip()).strip()
 
 
@@ -122,7 +82,7 @@ def _parsed(library: Path, text: str) -> dict[str, Material]:
             else:
                 left_out[f'"{shortened(line.strip())}"'] = None
         elif key == _TEXTURE:
-            material[key] = _picture(library.parent, rest, left_out)
+            material[key] = _texture(library.parent, rest, left_out)
         elif key and key not in _WITHOUT_EFFECT:
             left_out[key] = None
     if left_out:
@@ -132,7 +92,6 @@ def _parsed(library: Path, text: str) -> dict[str, Material]:
 
 
 def _leading_numbers(words: list[str], most: int) -> list[float]:
-    """The first words, as long as they are finite numbers."""
     numbers: list[float] = []
     for word in words[:most]:
         try:
@@ -144,9 +103,10 @@ def _leading_numbers(words: list[str], most: int) -> list[float]:
     return numbers
 
 
-def _picture(folder: Path, text: str, left_out: dict[str, None]) -> Picture:
-    """The picture of a map: options and the name of a file, which may have spaces."""
-    picture = Picture(folder)
+def _texture(folder: Path, text: str, left_out: dict[str, None]) -> SceneNode:
+    # The picture is looked up at ``scale * uv + offset``, and its linear values ``c`` become ``base + gain * c``.
+    scale, offset, base_and_gain = [1.0, 1.0, 1.0], [0.0, 0.0, 0.0], [0.0, 1.0]
+    is_clamped, is_blended = False, True
     while (option := text.split(None, 1)[0] if text else "") in _OPTIONS:
         words = text.split(None, 1 + _OPTIONS[option])[1:]
         numbers = _leading_numbers(words, _OPTIONS[option])
@@ -154,18 +114,30 @@ def _picture(folder: Path, text: str, left_out: dict[str, None]) -> Picture:
         text = "".join(text.split(None, 1 + count)[1 + count :])
         is_on = words[:1] == ["on"]
         if option in ("-s", "-o") and numbers:
-            values = picture.scale if option == "-s" else picture.offset
-            values[: len(numbers)] = numbers
+            (scale if option == "-s" else offset)[: len(numbers)] = numbers
         elif option == "-mm" and len(numbers) == 2:
-            picture.base, picture.gain = numbers
+            base_and_gain = numbers
         elif option == "-clamp":
-            picture.is_clamped = is_on
+            is_clamped = is_on
         elif option in ("-blendu", "-blendv"):
-            picture.is_blended &= is_on
+            is_blended &= is_on
         elif option not in _OPTIONS_WITHOUT_EFFECT and any(numbers or [1]):
             left_out[f'"{shortened(" ".join([option, *words[:count]]))}" of {_TEXTURE}'] = None
-    picture.path = _file(folder, text)
-    return picture
+    path = _file(folder, text)
+    picture: SceneNode = {"filename": str(path)}
+    if base_and_gain != [0, 1] and path.is_file():
+        form = mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.Float32
+        bitmap = np.array(mi.Bitmap(str(path)).convert(*form, srgb_gamma=False))
+        values = np.clip(base_and_gain[0] + base_and_gain[1] * bitmap, 0, 1)
+        picture = {"bitmap": mi.Bitmap(values.astype(np.float32))}
+    to_uv = mi.ScalarTransform4f().translate([0, 1, 0]).scale([1, -1, 1])  # OBJ's v points up, a bitmap's down
+    return {
+        "type": "bitmap",
+        **picture,
+        "to_uv": to_uv.translate([*offset[:2], 0]).scale([*scale[:2], 1]),
+        "wrap_mode": "clamp" if is_clamped else "repeat",
+        "filter_type": "bilinear" if is_blended else "nearest",
+    }
 
 
 def material_bsdf(material: Material, name: str) -> SceneNode:
@@ -177,11 +149,12 @@ def material_bsdf(material: Material, name: str) -> SceneNode:
     diffuse, highlights = _numbers(material, "Kd", 0.8, 0.8, 0.8), _numbers(material, "Ks", 0.0, 0.0, 0.0)
     colour: SceneNode = {"type": "rgb", "value": np.clip(diffuse, 0, 1).tolist()}
     texture = material.get(_TEXTURE)
-    if isinstance(texture, Picture):
-        if texture.path.is_file():
-            colour = texture.texture()
+    if isinstance(texture, dict):
+        path = Path(texture.get("filename", "."))
+        if "bitmap" in texture or path.is_file():
+            colour = texture if "bitmap" in texture else {**texture, "filename": str(path.resolve())}
         else:
-            warn(f'material "{name}": there is no picture "{texture.path}"; its colour is Kd')
+            warn(f'material "{name}": there is no picture "{path}"; its colour is Kd')
     (exponent,), (illumination,) = _numbers(material, "Ns", 0.0), _numbers(material, "illum", 2.0)
     glossy = {
         "type": "principled",
@@ -196,7 +169,7 @@ def material_bsdf(material: Material, name: str) -> SceneNode:
 
 
 def material_emitter(material: Material) -> SceneNode | None:
-    """The emitter of a material that shines; None if it does not."""
+    """The emitter of an emissive material; None for others."""
     radiance = _numbers(material, "Ke", 0.0, 0.0, 0.0)
     return {"type": "area", "radiance": {"type": "rgb", "value": radiance}} if max(radiance) > 0 else None
 

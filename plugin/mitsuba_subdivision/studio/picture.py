@@ -1,4 +1,4 @@
-"""Pictures of limit surfaces: their shading and rates, as far as a picture shows them, and denoising."""
+"""Pictures of limit surfaces: shading, rates that a picture needs, weights of lights, and denoising."""
 
 from __future__ import annotations
 
@@ -16,39 +16,31 @@ from ..shapes.interaction_hook import exact_shading_problem
 from ..shapes.parameter_table import SHADINGS
 from ..shapes.parameters import pixel_error_for
 from ..variants import SceneNode
+from .studio_entries import variant_in_use
 
 # Largest distance of triangles from the surface, in pixels. With exact shading only silhouettes show it. Interpolated
 # normals need more: a 32nd of a pixel is half of one at a quarter of the segments.
 ERRORS = {"exact": 0.1, "vertex": 0.5 / 4**2}
-# Which part of the vertices an estimate of the error holds for: borders and creases look more curved than they are, and
-# few vertices are at outlines.
+# Quantile of vertices for the estimated error: borders and creases look more curved than they are, and few vertices are
+# at outlines.
 MOST_VERTICES = {"exact": 0.95, "vertex": 0.99}
-# Segments on each edge of a cage: of uniform tessellations that a picture decides on, and of adaptive ones.
+# Most segments on each edge of a cage: of uniform and of adaptive tessellations that a picture needs.
 MOST_SEGMENTS, FINEST_RATE = 8, 64
-# Triangles of all surfaces of a scene.
-MOST_TRIANGLES = 4_000_000
-# As many uniform ones as take as long as the choice of adaptive ones.
-FEW_TRIANGLES = 20_000
-# Samples per pixel of albedo and normals, which take one ray each: enough for smooth edges, and for little noise where
-# a lens blurs them. Measured up to 256, more change nothing.
+# Most triangles of all surfaces of a scene, and uniform triangles that take as long as the choice of adaptive ones.
+MOST_TRIANGLES, FEW_TRIANGLES = 4_000_000, 20_000
+# Samples per pixel of albedo and normals, one ray each; more, up to 256, improve neither edges nor blurred parts.
 AUXILIARY_SPP = 64
-# Lights that are weighed: so many, the mean square of whose contributions is so many squares of their mean. For two or
-# equal ones, equal choices are better. Then the least weight as a part of their sum, and rays for each: as many as 640
-# by 480 pixels at a quarter of their size have with two samples.
+# Least number of lights that are weighed, and least ratio of the mean square of their contributions to the square of
+# the mean: equal choices are better for two or equal lights. Then the least part of a weight, and rays for each light.
 LEAST_LIGHTS, LEAST_UNEVEN, LEAST_WEIGHT, SCOUTS = 3, 1.3, 0.03, 2 * 160 * 120
-# Of the integrator `aov`; the last six channels of its film.
-_AUXILIARY = "albedo:albedo,normal:sh_normal"
+_AUXILIARY = "albedo:albedo,normal:sh_normal"  # AOVs of the denoiser, the last six channels of the film
 
 
-def shading_for(
-    variant: str,  # Variant in which the scene is rendered
-    parameters: SceneNode,  # Of the shape `subdivision`; by default its shading is `auto`
-) -> str:
-    """Shading of the limit surfaces of a scene, "exact" or "vertex".
+def shading_for(parameters: SceneNode) -> str:
+    """Shading of shapes ``subdivision`` with these parameters in the current variant, "exact" or "vertex".
 
-    If it is "vertex" because exact shading does not work, or takes long, a line on standard error says so: a warning
-    would make an error of every scene in a scalar variant where warnings are errors.
-    Raises ValueError if there is no such shading.
+    If exact shading does not work, or takes long, a line on standard error says so, as warnings may be errors.
+    Raises ValueError if the shading is unknown.
     """
     shading = parameters.get("shading", "auto")
     if shading not in SHADINGS:
@@ -57,7 +49,7 @@ def shading_for(
         return str(shading)
     if parameters.get("face_normals"):
         return "vertex"
-    problem = exact_shading_problem(getattr(mi, variant))
+    problem = exact_shading_problem(getattr(mi, variant_in_use()))
     if problem is None:
         return "exact"
     print_remark(f"normals are interpolated between vertices: {problem}")
@@ -71,7 +63,7 @@ def segments_for(
     near_clip: float,  # Of the sensor
     shading: str,
 ) -> NDArray[np.int64]:
-    """Estimate of the rate of a cage at which an image shows no facets, up to `FINEST_RATE`. Returns (n,) int64."""
+    """Rates ``(n,)`` of a cage, up to `FINEST_RATE`, at which an image shows no facets of its copies."""
     box = np.array([(x.min(), x.max()) for x in cage.positions.T]).T
     stretch = np.linalg.norm(to_world[:, :3, :3], 2, axis=(1, 2))
     corners = points_at(box_corners(box), to_world)
@@ -82,32 +74,29 @@ def segments_for(
 
 
 def highest_rate(
-    segments: NDArray[np.integer],  # (n,) int: that each cage needs
-    # (n,) int: of its faces; a quadrilateral has four, and two triangles for each square of the rate
-    corners: NDArray[np.integer],
+    segments: NDArray[np.integer],  # (n,) int: rate that each cage needs
+    corners: NDArray[np.integer],  # (n,) int: corners of its faces
 ) -> int:
-    """Largest rate, up to `FINEST_RATE`, with which cages have no more than `MOST_TRIANGLES`."""
+    """Largest rate, up to `FINEST_RATE`, at which cages have no more than `MOST_TRIANGLES`."""
+    # A quadrilateral has four corners, and two triangles for each square of the rate.
     rates = np.arange(2, FINEST_RATE + 1)
     triangles = (np.minimum(segments, rates[:, None]) ** 2 * corners).sum(axis=1) // 2
     return 1 + int(np.searchsorted(triangles, MOST_TRIANGLES, side="right"))
 
 
 def outline_for(sensor: SceneNode) -> SceneNode:
-    """Parameters of exactly shaded shapes that have the outlines that a sensor, an entry of a scene, sees."""
+    """Parameters of exactly shaded shapes with exact outlines for a sensor, an entry of a scene."""
     return pixel_error_for(mi.load_dict(sensor), ERRORS["exact"], outline=True)
 
 
 def triangles_for(
-    segments: int,  # That it needs on each edge
-    corners: int,  # Of the faces of its cage
-    most: int,  # Segments of a uniform tessellation at most
+    segments: int,  # Needed rate
+    corners: int,  # Corners of the faces of its cage
+    most: int,  # Highest uniform rate
     outline: SceneNode,  # See `outline_for`
-    highest: int,  # Segments on each edge of an adaptive one at most
+    highest: int,  # Highest adaptive rate
 ) -> SceneNode:
-    """Parameters of an exactly shaded shape in a still picture.
-
-    Adaptive triangles are chosen where that pays: not where uniform ones are few, or as many as the cage has.
-    """
+    """Parameters of an exactly shaded shape in a still picture, adaptive unless uniform triangles are few."""
     is_enough = segments <= most and segments**2 * corners <= 2 * FEW_TRIANGLES
     if is_enough or min(segments, highest) == 1:
         return {"tessellation_rate": min(segments, most)}
@@ -132,7 +121,7 @@ def _deviation(cage: ControlCage, shading: str) -> float:
 
 
 def pixels_of_boxes(corners: NDArray[np.float64], outline: SceneNode, near_clip: float) -> NDArray[np.float64]:
-    """Pixels that a unit of the world takes at most, within boxes of which the corners ``(n, 8, 3)`` are given."""
+    """Maximum pixels per world unit inside each box, with corners ``(n, 8, 3)``."""
     matrix = np.array(outline["sensor_to_world"].matrix, dtype=np.float64).reshape(4, 4)
     if not outline["sensor_fov"]:
         return np.full(len(corners), outline["film_width"] / (2 * np.linalg.norm(matrix[:3, 0])))
@@ -202,9 +191,9 @@ def render_denoised(
 ) -> NDArray[np.float32]:
     """Render a scene with the box filter, and remove its noise by Open Image Denoise.
 
-    With a wider filter, noise of neighbouring pixels would be correlated, and the denoiser would keep it. It gets the
-    albedo and the normals of the first hits, too, so that textures and edges stay. What is denoised is biased: do not
-    compare it, or take it for a reference.
+    With a wider filter, noise of neighbouring pixels would be correlated, and the denoiser would keep it. Albedo and
+    normals of the first hits preserve textures and edges. Denoised pictures are biased: do not compare them, or take
+    them for references.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Scenes written as XML files, with files beside them for what is in memory: cages, polygon meshes and images."""
+"""Scenes written as XML files, with files beside them for cages, polygon meshes and images in memory."""
 
 from __future__ import annotations
 
@@ -32,10 +32,8 @@ _NUMBER = re.compile(r"(?<![\w.])-?\d+\.?\d*(?:e[-+]?\d+)?(?![\w.])")
 # In place of a transform, while the scene is written.
 _PLACEHOLDER = "in place of transform"
 _TRANSFORM = re.compile(rf'( *)<string name="([^"]*)" value="{_PLACEHOLDER} (\d+)"/>\n')
-# Significant digits where single precision is not enough.
-DIGITS = 9
-# Tolerance for the orthogonality of a matrix that is written as a scale and a direction.
-_ORTHOGONAL = 1e-6
+DIGITS = 9  # Significant digits where single precision is not enough
+_ORTHOGONAL = 1e-6  # Tolerance for the orthogonality of a matrix that is written as a scale and a direction
 
 
 def save_scene(
@@ -49,10 +47,9 @@ def save_scene(
 
     Names of files in it become relative to it. Data in memory is written beside it, as ``NAME_ENTRY``
     with a suffix: cages as OBJ files, or as PLY or USD files if they have data that OBJ files cannot hold; polygon
-    meshes as PLY files; pictures as PNG or EXR files.
-    Returns list of Path: the files that were written; the scene is the last. Raises ValueError if the path does not end
-    in .xml, something in memory can be written to no file, or a file to write is one that the scene reads. Nothing has
-    been written then. Raises OSError if a file cannot be written.
+    meshes as PLY files; images as PNG or EXR files.
+    Returns the written files, the scene last. Raises ValueError, before anything is written, if the path does not end
+    in .xml, no file format holds an entry, or a file to write is an input. Raises OSError if a file cannot be written.
     """
     if path.suffix.lower() != ".xml":
         raise ValueError(f'scene "{path}"; expected a name ending in .xml')
@@ -71,10 +68,8 @@ def save_scene(
 
 
 def _as_text(state: mi.parser.ParserState) -> str:
-    """A parsed scene as XML, with transforms as look-at, and without digits beyond single precision.
-
-    Mitsuba itself leaves out what is below 1e-6 in transforms, whatever the unit.
-    """
+    """A parsed scene as XML, with transforms as look-at, and without digits beyond single precision."""
+    # Mitsuba would leave out numbers below 1e-6 in transforms, whatever the unit.
     transforms: list[NDArray[np.float64]] = []
     for node in state.nodes:
         for key in [key for key, _ in node.props.items() if node.props.type(key) == mi.Properties.Type.Transform]:
@@ -123,8 +118,6 @@ def _short(value: float) -> str:
 
 
 class _SceneParts:
-    """Collects the parts of a scene that are in memory, and writes them to files."""
-
     def __init__(
         self,
         path: Path,  # Of the scene's XML file. A part of the entry NAME becomes `SCENE_NAME` with a suffix.
@@ -137,10 +130,7 @@ class _SceneParts:
         self._cages: dict[tuple[tuple[str, Any], ...], tuple[Path, SceneNode]] = {}
 
     def in_files(self, name: str, node: SceneNode) -> SceneNode:
-        """A scene entry that refers to files instead of data in memory.
-
-        Raises ValueError if something cannot be written. Raises OSError if a file cannot be written.
-        """
+        """A scene entry with names of files in place of data. Raises ValueError for an object of Mitsuba."""
         entry = dict(node)
         if "positions" in node:
             entry = self._with_cage(name, node)
@@ -159,7 +149,7 @@ class _SceneParts:
         return entry
 
     def write(self) -> list[Path]:
-        """Write the files that have been found."""
+        """Write the files of all entries, and return their paths."""
         for path, write in self._writers.items():
             write(path)
         return list(self._writers)
@@ -212,7 +202,7 @@ class _SceneParts:
 
 
 def _contents(entry: SceneNode) -> CageContents:
-    """The cage described by properties of the shape ``subdivision``, without its scheme, which the scene keeps."""
+    """The cage of properties of the shape ``subdivision``, without its scheme, which the scene keeps."""
     arrays = {key: np.array(entry[key]) for key in _ARRAYS if key in entry}
     rules = {key: entry[key] for key in RULES if key in entry}
     data = read_attributes(entry)

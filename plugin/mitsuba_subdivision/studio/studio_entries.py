@@ -7,7 +7,7 @@ import numbers
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -32,21 +32,17 @@ UP_AXES = ("y", "z")
 View = str | Sequence[float]
 # Field of view of the picture's longer side, in degrees: that of long lenses for products and portraits.
 FIELD_OF_VIEW = 28.0
-# Part of the picture that stays empty on each side.
-MARGIN = 0.08
-# Least distance of the nearest point, in depths of the model: the furthest point then looks a fifth as large.
+MARGIN = 0.08  # Empty part of the picture on each side
+# Least distance of the nearest point, in depths of the model: the furthest point looks a fifth as large.
 NEAREST = 0.25
 DEFAULT_SIZE, DEFAULT_SPP, LARGEST_SIDE = (640, 480), 64, 1 << 14
-# Sizes of models that Mitsuba renders alike, as measured: lengths are squared in single precision.
-SIZES = (1e-9, 5e8)
-# Largest side of models that are enlarged, and the least side that they get: Mitsuba moves the origins of rays from
-# surfaces away by 9e-5 of a unit, or of their coordinates if these are more.
+SIZES = (1e-9, 5e8)  # Measured sizes of models that Mitsuba renders alike: lengths are squared in single precision
+# Largest side of models to enlarge, and their least enlarged side: Mitsuba offsets rays from surfaces by 9e-5 of a
+# unit, or of larger coordinates.
 SMALL, LARGE_ENOUGH = 1.0, 8.0
-# Of boxes: points beyond are infinite in single precision.
-LARGEST_BOX = 1e37
-
+LARGEST_BOX = 1e37  # Side of the largest box that is finite in single precision
 # Positions of lights, in radii of the model: right, back and up of its middle, for a camera in front. Then half their
-# sides, their radiance, and their sampling weights, chosen for least noise.
+# sides, their radiance, and their sampling weights of least noise.
 LIGHTS = {
     "key_light": ((-4.4, -1.9, 4.4), (1.5, 1.5), (16.0, 15.4, 14.6), 3.0),
     "fill_light": ((5.5, -4.0, 1.6), (2.5, 2.5), (0.55, 0.58, 0.62), 0.25),
@@ -57,26 +53,16 @@ STUDIO = (*LIGHTS, "ambient_light", "ground")
 ENVIRONMENT = "environment"
 # Entries that turn with the camera.
 RIG = (*LIGHTS, "ground", ENVIRONMENT)
-AMBIENT = (0.17, 0.175, 0.185)
-BACKDROP_COLOUR = (0.30, 0.305, 0.315)
+AMBIENT, BACKDROP_COLOUR = (0.17, 0.175, 0.185), (0.30, 0.305, 0.315)
 # Types of Mitsuba's integrator `aov`, by their own names and by those of Hydra and of other renderers.
 AOVS = {name: name for name in ("albedo", "depth", "position", "uv", "geo_normal", "sh_normal", "dp_du", "dp_dv")}
 AOVS |= {name: name for name in ("duv_dx", "duv_dy", "prim_index", "shape_index")}
 AOVS |= {"normal": "sh_normal", "normals": "sh_normal", "N": "sh_normal", "Ng": "geo_normal", "P": "position"}
 AOVS |= {"z": "depth", "st": "uv", "primId": "shape_index", "instanceId": "shape_index", "elementId": "prim_index"}
 LENGTHS = ("depth", "position", "dp_du", "dp_dv")
-# Distances behind the model's middle, in radii, at which the backdrop begins to bend and its wall stands.
-BEND, WALL = 1.6, 7.0
-# Distance of the floor below the model, in radii: a flat model must not coincide with the floor.
-GAP = 0.003
-
-
-class Environment(NamedTuple):
-    """A picture of all directions that shines, of equal angles, as USD's dome lights have."""
-
-    path: Path
-    turn: float = 0.0  # About the axis that points up, in degrees, counter-clockwise seen from above
-    strength: float = 1.0  # Factor of its radiance
+# Distances in radii: of the bend and the wall of the backdrop from the model's middle; and of the floor from the model,
+# as a flat model must not coincide with it.
+BEND, WALL, GAP = 1.6, 7.0, 0.003
 
 
 @dataclass(frozen=True)
@@ -84,22 +70,24 @@ class Look:
     """Display options of a model or a stage."""
 
     view: View = DEFAULT_VIEW  # str or (azimuth, elevation): from where the studio's camera looks
-    # (width, height) or None: of the film, in pixels. None for 640 by 480, or what a stage's render settings or its
-    # camera ask for.
+    # Width and height in pixels; None for those of a stage's render settings or camera, or 640 by 480
     size: tuple[int, int] | None = None
-    spp: int | None = None  # Samples per pixel; None for 64, or what a stage's render settings ask for
+    spp: int | None = None  # Samples per pixel; None for those of a stage's render settings, or 64
     up: str | None = None  # Axis of a cage that points up; None for that of its file
     rate: int | None = None  # Segments on each edge of a cage; None for as many as a picture needs
     shading: str = "vertex"  # Of a cage
     checker: bool = False  # Whether texture coordinates of a cage are shown as a checkerboard
     cage: bool = False  # Whether the control cage is drawn over its surface
-    # Pixels along the sides of the textures of a stage's materials at most; None for as many as the picture shows
-    texture_size: int | None = None
+    texture_size: int | None = None  # Most pixels along the sides of a stage's textures; None for no limit
     transparent: bool = False  # Whether the picture has alpha and no background
-    has_studio: bool = True  # Whether lights and backdrop of the studio are added where they are missing
-    scales: bool = False  # Whether a scene is made larger by `enlargement`
-    environment: Environment | None = None  # In place of all lights and the backdrop
-    # Types of Mitsuba's AOVs by the names of their channels, besides those of a stage; None for no channels at all
+    has_studio: bool = True  # Whether the studio adds missing lights, and a backdrop
+    scales: bool = False  # Whether small models are enlarged, see `enlargement`
+    # Picture of the light from all directions, of equal angles, in place of all lights and the backdrop; its turn about
+    # the axis that points up, in degrees, counter-clockwise seen from above; and the factor of its radiance
+    environment: Path | None = None
+    turn: float = 0.0
+    strength: float = 1.0
+    # Types of Mitsuba's AOVs by the names of their channels, besides those of a stage; None for no AOVs at all
     aovs: Mapping[str, str] | None = None
 
 
@@ -120,13 +108,11 @@ def studio(
     points: ArrayLike | None = None,
     name: str | None = None,  # Of the model, or of its file, with which messages begin
 ) -> SceneNode:
-    """Entries of a Mitsuba scene that stage a model: all but the model and ``"type": "scene"``.
+    """Entries of a scene around a model: "integrator", "sensor", lights and, in views from above, "ground".
 
-    A variant of Mitsuba must be set. The studio is sized for the model, and its lights turn with the camera. Where the
-    camera is below the model's middle there is no floor, and lights come from below.
-    Returns "integrator", "sensor", "key_light", "fill_light", "rim_light", "ambient_light" and, in views from above,
-    "ground". Raises ValueError if no variant is set, or an argument is invalid. Warns if the model is so small or large
-    that Mitsuba's single precision does not render it.
+    A variant of Mitsuba must be set. The studio is sized for the model, and its lights turn with the camera. In views
+    from below there is no floor, and lights come from below. Raises ValueError if no variant is set, or an argument is
+    invalid. Warns if Mitsuba's single precision cannot render the size of the model.
     """
     variant_in_use()
     prefix = "" if name is None else f"{name}: "
@@ -185,23 +171,21 @@ def studio(
 
 
 def finished(scene: SceneNode, look: Look, up: str) -> SceneNode:
-    """A scene with the environment and the AOVs of a look, without a studio or its background, as the look says."""
+    """A scene with the environment, the AOVs and the background of a look."""
     left: tuple[str, ...] = ("ground",) if look.transparent else ()
     if look.environment is not None or not look.has_studio:
         left = STUDIO
     scene = {name: entry for name, entry in scene.items() if name not in left}
     if look.environment is not None:
-        matrix = studio_axes(up) @ turned(look.environment.turn) @ studio_axes("y").T
-        to_world, name = _transform(matrix, np.zeros(3)), str(look.environment.path.resolve())
-        picture = {"filename": name, "scale": look.environment.strength, "to_world": to_world}
-        scene[ENVIRONMENT] = {"type": "envmap", **picture}
+        to_world = _transform(studio_axes(up) @ turned(look.turn) @ studio_axes("y").T, np.zeros(3))
+        picture = {"filename": str(look.environment.resolve()), "scale": look.strength}
+        scene[ENVIRONMENT] = {"type": "envmap", **picture, "to_world": to_world}
     scene = _without_background(scene) if look.transparent else scene
     aovs = ",".join(f"{name}:{kind}" for name, kind in (look.aovs or {}).items())
     return {**scene, "integrator": {"type": "aov", "aovs": aovs, "image": scene["integrator"]}} if aovs else scene
 
 
 def _without_background(scene: SceneNode) -> SceneNode:
-    """A scene whose film has alpha, and whose camera sees neither environment nor lamps."""
     hidden = {**scene["integrator"], "hide_emitters": True}
     if any(map(_is_glowing_mesh, scene.values())):
         hidden = {"type": FOREGROUND, "hidden": hidden, "shown": scene["integrator"]}
@@ -217,14 +201,12 @@ def _is_glowing_mesh(entry: Any) -> bool:
 
 def framed(
     points: NDArray[np.float64],  # (n, 3) float64: in the studio's axes
-    # Where the camera is, seen from the points, in degrees
     azimuth: float,
     elevation: float,
     size: tuple[int, int],  # (width, height)
 ) -> tuple[NDArray[np.float64], float]:
-    """Place a camera so that points just fit into its image, centred, but for `MARGIN`.
+    """Place a camera so that points fill its image, centred, within `MARGIN`, unless they are deeper than wide.
 
-    Points that are deeper than they are wide are smaller than that, as the camera keeps away from them.
     Returns its place in the studio's axes, and its distance from the middle of the points, along the view.
     """
     axes = camera_axes(azimuth, elevation)
@@ -241,16 +223,16 @@ def framed(
 
 
 def outermost(points: NDArray[np.float64], up: str, view: View, size: tuple[int, int]) -> NDArray[np.float64]:
-    """The few of points in the world that determine the camera of `framed`, and the bounds of all points."""
+    """Subset of points in the world with the same camera of `framed`, and the same bounds."""
     x, y = _slopes(size)
-    # Away from each side of what the camera sees, then along its view and along the axes.
+    # Normals of the sides of the view frustum, its direction, and the axes.
     towards = np.array([[1, 0, -x], [-1, 0, -x], [0, 1, -y], [0, -1, -y], [0, 0, 1], [0, 0, -1]])
     directions = np.concatenate([towards @ camera_axes(*angles_of(view)).T, np.eye(3), -np.eye(3)])
     return points[np.unique((points @ studio_axes(up) @ directions.T).argmax(axis=0))]
 
 
 def _slopes(size: tuple[int, int]) -> NDArray[np.float64]:
-    """Half extents of what points may fill per unit of depth, horizontally and vertically."""
+    """Half extents of the view frustum within its margin, per unit of depth, horizontally and vertically."""
     return np.tan(np.radians(FIELD_OF_VIEW / 2)) * np.array(size) / max(size) * (1 - 2 * MARGIN)
 
 
@@ -299,7 +281,7 @@ def turned(azimuth: float) -> NDArray[np.float64]:
 def sampler(spp: int) -> SceneNode:
     """Well-spread samples of a pixel, at least so many, as for ``mi.load_dict``.
 
-    They fill a grid: 32 become 35, as 5 times 7, what Mitsuba would make them with a warning.
+    They fill a grid: 32 become 35, as 5 times 7; Mitsuba would do so with a warning.
     """
     rows = math.isqrt(spp)
     return {"type": "multijitter", "sample_count": -(-spp // rows) * rows}
