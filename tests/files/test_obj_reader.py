@@ -99,6 +99,7 @@ def obj_files(tails):
     return texts.map(joined)
 
 
+@pytest.mark.long
 @given(content=st.sampled_from(TAILS).flatmap(obj_files))
 @settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_agrees_with_a_reader_of_lines(content, obj_file):

@@ -46,6 +46,7 @@ def test_outline_gradients_are_changes_of_the_covered_area(name):
 
 
 @exact
+@pytest.mark.long
 @pytest.mark.parametrize("case", LIT)
 def test_derivatives_by_size_of_lit_surfaces_are_differences_of_their_pictures(case):
     """Both the shading and what the outline hides move; the radiance beside the outline is that of the picture."""

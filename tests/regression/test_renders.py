@@ -281,6 +281,7 @@ def frame_after_a_death(frame, marker, command, number):
     return frame(command, number)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_a_cluster_gives_the_bits_of_one_machine_although_a_worker_dies(tmp_path, monkeypatch, capsys):
     distributed = pytest.importorskip("distributed")
