@@ -117,8 +117,8 @@ def scene_entries(
         groups.append(add(f"group_{number}", {"type": "shapegroup", **shapes}) if shapes else None)
     for instance in contents.instances:
         if groups[instance.group] is not None:
-            entry = {"type": "instance", "to_world": mi.ScalarTransform4f(instance.to_world.tolist())}
-            add(instance.name, {**entry, "group": {"type": "ref", "id": groups[instance.group]}})
+            place = {"to_world": mi.ScalarTransform4f(instance.to_world.tolist())}
+            add(instance.name, {"type": "instance", "group": {"type": "ref", "id": groups[instance.group]}, **place})
     # The integrator volpath, or a dome, finds lights behind clear shapes of other lights.
     has_dome = any(light.kind == "dome" for light in contents.lights)
     are_clear = has_dome or (bool(rest) and rest["integrator"]["type"] == "volpath")
