@@ -76,7 +76,7 @@ def test_interrupts_within_the_work_are_reported(monkeypatch, capsys):
 
 @pytest.mark.parametrize(
     ("variant", "shading", "seconds", "words"),
-    [("scalar_rgb", "vertex", 0.3, ["--passes", "2"]), ("llvm_ad_rgb", "exact", 1, [])],
+    [("scalar_rgb", "vertex", 0.3, ["--passes", "2"]), ("llvm_ad_rgb", "exact", 3, [])],
 )
 def test_ctrl_c_ends_a_render(tmp_path, shading, seconds, words, variant, request):
     if shading == "exact" and hook_problem():
