@@ -90,19 +90,23 @@ def scene_entries(
             shared[material] = add(material.name, make())
         return entry({"type": "ref", "id": shared[material]})
 
+    def area_light(shape: ShapeContents) -> SceneNode | None:
+        emitted = None if shape.radiance is None else rgb(np.array(shape.radiance) / _light_area(shape))
+        if emitted is None and shape.material is not None:
+            emitted = radiance(shape.material, textures, notes)
+        if emitted is not None and shape.curves is not None:
+            notes.add("emission of curves is ignored; Mitsuba's curves are no lights", shape.name)
+        return None if emitted is None else {"type": "area", "radiance": emitted}
+
+    # Not by recursion: a function that refers to itself would keep all textures until the next garbage collection.
     def shown(shape: ShapeContents) -> SceneNode | mi.Object | None:
         """A shape; None, with a warning, if it is unusable."""
         try:
-            emitted = None if shape.radiance is None else rgb(np.array(shape.radiance) / _light_area(shape))
-            if emitted is None and shape.material is not None:
-                emitted = radiance(shape.material, textures, notes)
-            if emitted is not None and shape.curves is not None:
-                notes.add("emission of curves is ignored; Mitsuba's curves are no lights", shape.name)
-            area = None if emitted is None else {"type": "area", "radiance": emitted}
-            return made(shape, area)
+            return made(shape, area_light(shape))
         except SchemeError as error:
             notes.add_message(f"{error}; the mesh is shown as polygons", shape.name)
-            return shown(as_polygons(shape))
+            polygons = as_polygons(shape)
+            return made(polygons, area_light(polygons))
         except CageError as error:
             notes.add_message(f"{error}; the prim is left out", shape.name)
             return None

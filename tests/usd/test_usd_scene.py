@@ -1,6 +1,8 @@
 """Whole USD files as scenes of Mitsuba."""
 
+import gc
 import re
+import weakref
 from functools import partial
 from itertools import product
 
@@ -13,10 +15,11 @@ import pytest
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import CageError, CageWarning
 from mitsuba_subdivision.cage.contents import same
-from mitsuba_usd import materialx_layers, stage_meshes
+from mitsuba_usd import materialx_layers, stage_meshes, stage_scenes
 from mitsuba_usd.stage_settings import read_variant
 from mitsuba_usd.stage_walk import StageReader
 from mitsuba_usd.texture_image import read_texture_image
+from mitsuba_usd.textures import Textures
 from scipy.spatial import cKDTree
 from usd import stages
 from usd.stages import CUBE, POLYGONS, SQUARE, bound, camera, material, mesh, moved, prim, shader, subset, texture, told
@@ -553,6 +556,20 @@ def test_textures_have_a_limit_that_can_be_set(scene, tmp_path):
         assert np.array(paint["bsdf"]["base_color"]["bitmap"]).shape == (side, side, 3)
     with pytest.raises(ValueError, match="texture_size 0; expected 1 or more"):
         scene(text, texture_size=0)
+
+
+def test_textures_are_freed_without_a_garbage_collection(scene, monkeypatch):
+    """Earlier, decoded images of a hundred megabytes stayed."""
+    made = []
+    monkeypatch.setattr(stage_scenes, "Textures", lambda *given: made.append(Textures(*given)) or made[-1])
+    gc.collect()
+    gc.disable()
+    try:
+        scene(mesh("cube", CUBE))
+        freed = [weakref.ref(made.pop()) for _ in [*made]]
+        assert [reference() for reference in freed] == [None]
+    finally:
+        gc.enable()
 
 
 def test_materials_that_differ_by_their_names_only_are_one(scene):

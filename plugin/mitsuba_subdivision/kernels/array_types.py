@@ -43,8 +43,7 @@ Ray = Any
 
 # Mode of scatters to distinct indices. With other modes, Dr.Jit runs a kernel before each further scatter to an array.
 NO_CONFLICTS = dr.ReduceMode.NoConflicts
-# Mode of sums. The default gives each thread a copy of a small array: what Dr.Jit 1.5 records with one thread and runs
-# again with more writes beyond the array.
+# Mode of sums: by default, what Dr.Jit 1.5 records with one thread and runs again with more writes beyond small arrays.
 SUMS = dr.ReduceMode.Local
 
 # Arrays that each thread has computed, by `LaterArrays`.

@@ -8,6 +8,7 @@ import time as clock
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from functools import partial
+from hashlib import blake2b
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -24,7 +25,7 @@ from ..evaluation.equations import Evaluator
 from ..files.formats import FORMATS
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..mesh.shared import Content, Shared
+from ..mesh.shared import Shared
 from ..surface import TEXCOORDS, LimitSurface
 from .cage_attributes import RESERVED
 from .parameter_table import PARAMETER_OF_NAME, errors_about, value_of
@@ -382,7 +383,7 @@ def cage_of_arrays(name: str | None, **arguments: Any) -> ControlCage:
     Messages contain ``name``. Without a name, it warns for each shape; with a name, the creator of the cage has warned
     before.
     """
-    key = name is None, _content(arguments)
+    key = name is None, _content(arguments)  # Without references to arrays, of which the cage has copies
     if name is None:
         return _shared(key, ControlCage.from_arrays, **arguments)
     with without_warnings():
@@ -392,9 +393,9 @@ def cage_of_arrays(name: str | None, **arguments: Any) -> ControlCage:
 
 def _content(value: Any) -> Hashable:
     if isinstance(value, np.ndarray):
-        return Content(value)
+        return value.shape, value.dtype.str, blake2b(np.ascontiguousarray(value).data, digest_size=16).digest()
     if isinstance(value, Attribute):
-        return value.interpolation, Content(value.values), Content(value.indices)
+        return value.interpolation, _content(value.values), _content(value.indices)
     return tuple((name, _content(item)) for name, item in sorted(value.items())) if isinstance(value, dict) else value
 
 
