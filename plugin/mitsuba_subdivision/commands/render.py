@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..cage.errors import CageWarning, warn
 from ..files import require_usd
-from ..files.formats import FORMATS
+from ..files.formats import FORMATS, is_usd
 from ..messages import counted, print_remark, print_result
 from ..regression import renders
 from ..regression.image import METADATA_ATTRIBUTE, save_image
@@ -236,9 +236,7 @@ def _stated_variant(options: argparse.Namespace) -> str | None:
 
 def _is_stage(options: argparse.Namespace) -> bool:
     """Whether a USD file is rendered as a whole."""
-    file_format = FORMATS.get(options.scene.suffix.lower())
-    is_usd = file_format is not None and file_format.has_prims
-    return is_usd and not any(getattr(options, name) for name in _OF_ONE_MESH)
+    return is_usd(options.scene) and not any(getattr(options, name) for name in _OF_ONE_MESH)
 
 
 def _require_effect(options: argparse.Namespace, is_model: bool) -> None:

@@ -88,6 +88,12 @@ def write_file(contents: CageContents, path: str | Path) -> None:
     function_named(FORMATS[suffix].write)(contents, path)
 
 
+def is_usd(path: Path) -> bool:
+    """Whether a file may hold several meshes, and values at several times."""
+    known = FORMATS.get(path.suffix.lower())
+    return known is not None and known.has_prims
+
+
 def require_triangle_format(path: str | Path) -> str:
     """The suffix of a file of triangles. Raises ValueError if the format is unknown."""
     writable = [suffix for suffix, known in FORMATS.items() if known.write_triangles]

@@ -168,21 +168,21 @@ class MeshBuffers:
         return self._types.gathered(flat, self._copied)
 
     def _placed(self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer) -> dict[str, FloatBuffer]:
-        placement, surface, shading = self._placement, self._surface, self._shading
+        placement, shading = self._placement, self._shading
         positions, normals = self._split(positions), self._split(normals)
         if self._displaced is not None:
             positions, normals = self._displaced(positions, normals, points)
         if not placement.is_identity:
             positions, normals = placement.placed(positions, normals)
         moved = {"vertex_positions": positions, "vertex_normals": normals}
-        if surface is not None and shading is not None:
-            moved |= {"coefficients": surface.coefficients, "to_world": placement.matrix}
+        if shading is not None:
+            moved |= {"coefficients": shading.kernel.coefficients, "to_world": placement.matrix}
         if self.are_differentiable:
             attached = {name: array for name, array in moved.items() if dr.grad_enabled(array)}
             if attached:
                 moved |= self.passes.watched(attached, self._on_backward)
-        if surface is not None and shading is not None:
-            surface.values.take(moved.pop("coefficients"))
+        if shading is not None:
+            shading.kernel.values.take(moved.pop("coefficients"))
             shading.update(moved.pop("to_world"), placement)
         return moved
 

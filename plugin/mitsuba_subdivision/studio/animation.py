@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..cage import CageError, CageWarning
 from ..device_arrays import upload
+from ..files.formats import is_usd
 from ..mitsuba_mesh import points_at, with_meshes
 from ..regression.scene import LoadedScene, load_scene
 from ..variants import SceneNode
@@ -52,7 +53,7 @@ class SceneSource(ABC, Generic[Contents]):
         self._has_files = numbers is not None and bool(PATTERN.search(self._path.name))
         if numbers is None:
             return
-        if not self._has_files and not self._path.suffix.lower().startswith(".usd"):
+        if not self._has_files and not is_usd(self._path):
             expected = "a name such as frame_%04d.obj"
             raise CageError(f'"{model}": frames are times of a USD file, or files; expected {expected}')
         missing = [file for number in numbers if not (file := self._file_and_time(number)[0]).is_file()]
