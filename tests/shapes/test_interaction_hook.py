@@ -161,7 +161,7 @@ def ask():
     with contextlib.suppress(ValueError):
         print(scene.ray_intersect(mi.Ray3f(mi.Point3f(dr.arange(mi.Float, 2), 0.1, 4), [0, 0, -1])).is_valid())
     return dr.whos(as_string=True).count('\\n')
-def fail(self, si, hit):
+def fail(self, si, *_):
     si.uv = mi.Point2f(3 * si.p.x, si.p.y)
     raise ValueError
 ask()
