@@ -3,7 +3,7 @@ from threading import Barrier
 
 import numpy as np
 import pytest
-from mitsuba_subdivision.mesh.shared import Content, Shared
+from mitsuba_subdivision.mesh.shared import Content, shared_by_key
 
 THREADS = 4
 # Seconds, by far more than threads take to begin.
@@ -21,18 +21,18 @@ def pool():
 
 
 def test_values_of_different_keys_are_made_at_the_same_time(pool):
-    shared, all_make = Shared(), Barrier(THREADS)
+    all_make = Barrier(THREADS)
 
     def make():
         all_make.wait(LIMIT)
         return _Value()
 
-    values = list(pool.map(lambda key: shared.get(key, make), range(THREADS)))
+    values = list(pool.map(lambda key: shared_by_key(key, make), range(THREADS)))
     assert len(set(values)) == THREADS
 
 
 def test_a_value_that_several_threads_request_is_made_once(pool):
-    shared, all_request, made = Shared(), Barrier(THREADS), []
+    all_request, made = Barrier(THREADS), []
 
     def make():
         made.append(_Value())
@@ -40,32 +40,30 @@ def test_a_value_that_several_threads_request_is_made_once(pool):
 
     def request(_):
         all_request.wait(LIMIT)
-        return shared.get("key", make)
+        return shared_by_key("key", make)
 
     assert {*pool.map(request, range(THREADS))} == {*made}
     assert len(made) == 1
 
 
 def test_a_value_is_kept_while_it_is_referenced():
-    shared = Shared()
-    value = shared.get("key", _Value)
-    assert shared.get("key", _Value) is value
+    value = shared_by_key("key", _Value)
+    assert shared_by_key("key", _Value) is value
     del value
     other = _Value()
-    assert shared.get("key", lambda: other) is other
+    assert shared_by_key("key", lambda: other) is other
 
 
 def test_a_value_that_could_not_be_made_is_tried_again():
-    shared = Shared()
     with pytest.raises(ZeroDivisionError):
-        shared.get("key", lambda: 1 // 0)
+        shared_by_key("key", lambda: 1 // 0)
     value = _Value()
-    assert shared.get("key", lambda: value) is value
+    assert shared_by_key("key", lambda: value) is value
 
 
 def test_making_a_value_may_request_others():
-    shared, inner = Shared(), _Value()
-    assert shared.get("outer", lambda: shared.get("inner", lambda: inner)) is inner
+    inner = _Value()
+    assert shared_by_key("outer", lambda: shared_by_key("inner", lambda: inner)) is inner
 
 
 def test_arrays_are_the_same_key_if_their_numbers_type_and_shape_are():

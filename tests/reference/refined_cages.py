@@ -1,14 +1,14 @@
 """Cages and their refinements for tests of borders and creases."""
 
 from dataclasses import replace
+from weakref import WeakValueDictionary
 
 import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.errors import without_warnings
+from mitsuba_subdivision.mesh import shared
 from mitsuba_subdivision.mesh.cuts import CutMesh
-from mitsuba_subdivision.mesh.shared import Shared
 from mitsuba_subdivision.patches import patch_table
-from mitsuba_subdivision.surface import limit_surface
 from patches.closed_cages import polygons
 
 from reference.refinement import Channel
@@ -88,4 +88,4 @@ def refine_first(monkeypatch, many_classes=0):
     for name, value in (("MANY_CLASSES", many_classes), ("FEW_PATCHES", 1 << 40), ("FEWER", 0)):
         monkeypatch.setattr(patch_table, name, value)
     # Surfaces would share the patches of others that are there already.
-    monkeypatch.setattr(limit_surface, "_PATCHES", Shared())
+    monkeypatch.setattr(shared, "_values", WeakValueDictionary())

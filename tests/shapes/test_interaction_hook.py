@@ -5,6 +5,7 @@ import mmap
 import re
 import traceback
 import weakref
+from types import SimpleNamespace
 
 import drjit as dr
 import mitsuba as mi
@@ -160,7 +161,7 @@ def ask():
     with contextlib.suppress(ValueError):
         print(scene.ray_intersect(mi.Ray3f(mi.Point3f(dr.arange(mi.Float, 2), 0.1, 4), [0, 0, -1])).is_valid())
     return dr.whos(as_string=True).count('\\n')
-def fail(self, si, hit):
+def fail(self, si, *_):
     si.uv = mi.Point2f(3 * si.p.x, si.p.y)
     raise ValueError
 ask()
@@ -460,15 +461,30 @@ def test_another_version_works_if_nothing_has_moved(monkeypatch):
     assert hit(make(), *TOP).is_valid()
 
 
-def hard_of_hearing(trial, si, hit):
-    HEARS(trial, si, hit._replace(flags=hit.flags + 1))
+def triangle_with(name, changed):
+    """Triangles of the trial with another override, which a function makes of the right one."""
+    make = interaction_hook._triangle
+
+    def made(variant):
+        triangle = make(variant)
+        setattr(type(triangle), name, changed(getattr(type(triangle), name)))
+        return triangle
+
+    return made
 
 
-def mute(trial, _, hit):
-    trial.asked = interaction_hook._asked(hit)
+def hard_of_hearing(complete):
+    return lambda triangle, si, *hit: complete(triangle, si, *hit[:2], hit[2] + 1, *hit[3:])
 
 
-HEARS = interaction_hook.Trial.complete
+def mute(complete):
+    return lambda triangle, _, *hit: complete(triangle, SimpleNamespace(), *hit)
+
+
+def silent(_):
+    return lambda *_: None
+
+
 UNHEARD = "virtual functions of Mitsuba 3.9; of those of 3.9.*, {} does not pass on its arguments, or its result"
 UNKNOWN = "0 virtual functions {} of the known arguments; expected one"
 
@@ -479,12 +495,12 @@ UNKNOWN = "0 virtual functions {} of the known arguments; expected one"
         ("virtual_functions", lambda *_: [0, 0, 0], UNKNOWN.format("compute_surface_interaction")),
         ("_ATTRIBUTE_ARGUMENTS", "int", UNKNOWN.format("eval_attribute")),
         ("_OUTLINE_ARGUMENTS", "int", UNKNOWN.format("sample_silhouette")),
-        ("Trial.turn_outline", lambda *_: None, UNHEARD.format("sample_silhouette")),
+        ("_triangle", triangle_with("turn_outline", silent), UNHEARD.format("sample_silhouette")),
         ("_INTERACTION_ARGUMENTS", "int", UNKNOWN.format("compute_surface_interaction")),
         ("InteractionHook.attach", lambda *_: None, UNHEARD.format("compute_surface_interaction")),
-        ("Trial.complete", hard_of_hearing, UNHEARD.format("compute_surface_interaction")),
-        ("Trial.complete", mute, UNHEARD.format("compute_surface_interaction")),
-        ("Trial.attribute", lambda *_: None, UNHEARD.format("eval_attribute")),
+        ("_triangle", triangle_with("complete", hard_of_hearing), UNHEARD.format("compute_surface_interaction")),
+        ("_triangle", triangle_with("complete", mute), UNHEARD.format("compute_surface_interaction")),
+        ("_triangle", triangle_with("attribute", silent), UNHEARD.format("eval_attribute")),
     ],
 )
 @llvm

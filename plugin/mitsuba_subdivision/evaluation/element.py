@@ -111,7 +111,7 @@ def evaluate_samples(
     normal: FloatArray = np.full((3, count), np.nan, dtype=dtype)
     # Only points in space have normals, texture coordinates do not.
     if len(extent) == 3:
-        framed = np.flatnonzero(located.per_sample([np.full(len(r.level), r.frame is not None) for r in rows]))
+        framed = np.flatnonzero(located.per_sample([np.full(len(r.level), r.have_frame) for r in rows]))
         if len(framed):
             framed_samples, framed_points = located.chosen(framed), _chosen(points, located, framed)
             frames = framed_samples.weights([r.tangents for r in framed_samples.rows(evaluator, dtype, 1)])

@@ -53,14 +53,10 @@ class SampleRows:
     # (2, s): ``(2 λ_2)ⁿ`` and ``(4 λ_2)ⁿ`` in the stabilised form; 1 in the other forms, and at the extraordinary point
     derivative_scale: FloatArray
     level: NDArray[np.int64]  # (s,) int64: n; `AT_EXTRAORDINARY_POINT` at the point itself
-    # (2, s, K): coefficients of two tangents whose cross product is along the normal, where the derivatives give none:
-    # on borders and creases and at sharp vertices. None elsewhere.
-    frame: FloatArray | None = None
-
-    @property
-    def tangents(self) -> FloatArray:
-        """The frame, or the first derivatives if there is no frame."""
-        return self.rows[1:3] if self.frame is None else self.frame
+    # (2, s, K): coefficients of two tangents whose cross product is along the normal: the first derivatives, or a frame
+    # where these give no normal, on borders and creases and at sharp vertices
+    tangents: FloatArray
+    have_frame: bool = False
 
 
 def locate(domain: ParameterDomain, uv: FloatArray) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:

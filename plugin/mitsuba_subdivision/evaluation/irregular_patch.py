@@ -136,7 +136,8 @@ class IrregularPatch:
         rows[:, at_point], scale[:, at_point] = np.nan, 1
         if evaluator in ("stabilized", "limit"):
             rows[0, at_point], rows[1:3, at_point] = np.eye(1, rows.shape[2])[0], self.edge_tangents[:, None]
-        return SampleRows(rows, scale, np.where(at_point, AT_EXTRAORDINARY_POINT, level), frame)
+        level = np.where(at_point, AT_EXTRAORDINARY_POINT, level)
+        return SampleRows(rows, scale, level, rows[1:3] if frame is None else frame, have_frame=frame is not None)
 
 
 def level_polynomials(patch: IrregularPatch, form: FloatArray, levels: NDArray[np.int64]) -> FloatArray:

@@ -59,14 +59,6 @@ class Leaves:
     # For each leaf: its depth, its index among the nodes of this depth, its piece, and its slice of `uv`
     parts: list[tuple[int, int, Piece, slice]]
 
-    def rows(self, scheme: Scheme, evaluator: Evaluator, dtype: DTypeLike, derivatives: int) -> SampleRows:
-        """Return rows over the eigen-coordinates; for regular patches and "power", over the control points."""
-        if self.patch is not None:
-            return self.patch.rows(self.uv, evaluator, dtype, derivatives)
-        rows = scheme.regular_basis(self.uv.astype(dtype, copy=False), derivatives)
-        count = len(self.uv)
-        return SampleRows(rows, np.ones((2, count), dtype=dtype), np.zeros(count, dtype=np.int64))
-
 
 class LocatedSamples:
     """Samples, and the leaves of patch trees that contain them. Raises SchemeError as `patch_trees` does."""
@@ -148,8 +140,16 @@ class LocatedSamples:
         return LocatedSamples(self.scheme, elements, element[which], uv[which], corner[which])
 
     def rows(self, evaluator: Evaluator, dtype: DTypeLike, derivatives: int) -> list[SampleRows]:
-        """Return `Leaves.rows` of all `leaves`."""
-        return [leaves.rows(self.scheme, evaluator, dtype, derivatives) for leaves in self.leaves]
+        """Return rows of each of the `leaves`, over eigen-coordinates; regular ones and "power" over control points."""
+        of_leaves = []
+        for leaves in self.leaves:
+            if leaves.patch is not None:
+                of_leaves.append(leaves.patch.rows(leaves.uv, evaluator, dtype, derivatives))
+                continue
+            rows, count = self.scheme.regular_basis(leaves.uv.astype(dtype, copy=False), derivatives), len(leaves.uv)
+            ones, level = np.ones((2, count), dtype=dtype), np.zeros(count, dtype=np.int64)
+            of_leaves.append(SampleRows(rows, ones, level, rows[1:3]))
+        return of_leaves
 
     def weights(
         self,

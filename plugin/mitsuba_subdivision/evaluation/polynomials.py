@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from math import factorial
 
@@ -140,12 +140,9 @@ class PolynomialBasis:
     @cached_property
     def of_controls(self) -> FloatArray:
         """``(b, R)`` float64: Bernstein coefficients over a regular patch's control points."""
-        of_monomials = self.bernstein.coefficients(self.monomials(self.bernstein.indices / self.bernstein.degree))
+        sites = self.bernstein.indices / self.bernstein.degree
+        of_monomials = self.bernstein.coefficients(monomial_values(self.powers, sites - self.domain.centre)[0].T)
         return _clean(_clean(of_monomials) @ self.matrix)
-
-    def monomials(self, uv: FloatArray) -> FloatArray:
-        """Return ``(s, m)`` values of the monomials at ``(s, 2)`` parameters."""
-        return monomial_values(self.powers, uv - self.domain.centre)[0].T
 
 
 def monomial_values(powers: IntArray, st: FloatArray) -> FloatArray:
@@ -168,11 +165,11 @@ def polynomial_basis(scheme: Scheme) -> PolynomialBasis:
     uv = uv[scheme.domain.inside(uv) >= 0]
     powers: IntArray = np.indices((HIGHEST_POWER + 1,) * 2).reshape(2, -1).T
     basis_values = scheme.regular_basis(uv, 1)[0]
-    all_powers = PolynomialBasis(scheme.domain, powers, np.empty((len(powers), basis_values.shape[1])))
-    matrix, *_ = np.linalg.lstsq(all_powers.monomials(uv), basis_values, rcond=INDEPENDENT)
-    powers = powers[np.abs(matrix).max(axis=1) > NO_COEFFICIENT]
+    monomials = monomial_values(powers, uv - scheme.domain.centre)[0].T
+    matrix, *_ = np.linalg.lstsq(monomials, basis_values, rcond=INDEPENDENT)
+    occurs = np.abs(matrix).max(axis=1) > NO_COEFFICIENT
     # Solve again without the powers that do not occur, which is more accurate.
-    values = replace(all_powers, powers=powers).monomials(uv)
+    powers, values = powers[occurs], monomials[:, occurs]
     basis = PolynomialBasis(scheme.domain, powers, np.linalg.lstsq(values, basis_values, rcond=INDEPENDENT)[0])
     error = np.abs(values @ basis.matrix - basis_values).max()
     if error > ROUNDED or basis.powers[0].any():

@@ -106,7 +106,7 @@ def arrays_in(value: Any, seen: set[int]) -> Iterator[Any]:
 
 
 class LaterArrays:
-    """A value of `Shared` that computes its arrays at their first use in each thread.
+    """A shared value that computes its arrays at their first use in each thread.
 
     Kernels of a thread do not wait for those of another, and waiting would begin other work that Dr.Jit has queued.
     """

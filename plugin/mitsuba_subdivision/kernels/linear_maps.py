@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..evaluation.polynomials import polynomial_basis
 from ..mesh import ragged
-from ..mesh.shared import Content, Shared
+from ..mesh.shared import Content, shared_by_key
 from ..patches.piece_table import PACKET, PieceTable, piece_packets
 from .array_types import (
     NO_CONFLICTS,
@@ -38,9 +38,6 @@ from .array_types import (
 
 if TYPE_CHECKING:
     from scipy import sparse
-
-_MATRICES: Shared[SparseMatrix] = Shared()
-_MADE: Shared[LaterArrays] = Shared()
 
 
 def attached(values: Any, argument: Any, forward: Callable[..., Any], backward: Callable[..., Any]) -> Any:
@@ -87,8 +84,8 @@ class SparseMatrix:
     @classmethod
     def shared(cls, matrix: sparse.csr_array, float_type: type) -> SparseMatrix:
         """A matrix whose rows sum to one; equal ones share the object while it is referenced."""
-        key = float_type, *map(Content, (matrix.data, matrix.indices, matrix.indptr)), matrix.shape
-        return _MATRICES.get(key, lambda: cls(matrix, float_type))
+        key = cls, float_type, *map(Content, (matrix.data, matrix.indices, matrix.indptr)), matrix.shape
+        return shared_by_key(key, lambda: cls(matrix, float_type))
 
     def __call__(
         self,
@@ -367,7 +364,7 @@ class ControlValues:
         Objects with equal values and the same map share the array until `set` is called.
         """
         linear_map = self._map
-        self._shared = _MADE.get((linear_map, Content(values)), LaterArrays)
+        self._shared = shared_by_key((LaterArrays, linear_map, Content(values)), LaterArrays)
         self.take(self._shared.get(lambda: linear_map(self._types.floats(values), self.size)))
         return self
 

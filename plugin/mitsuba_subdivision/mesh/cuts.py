@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from . import ragged
 from .connectivity import INFINITE, CreaseMethod, FloatArray, IntArray, SemiSharpness, Topology, VertexRule
 from .manifold import NonManifold, fan_labels
-from .shared import Content, Shared
+from .shared import Content, shared_by_key
 
 # Modes in which one of two values at a vertex may make the other a corner, or sharpen it by its semi-sharp edges.
 _CORNERS_PLUS = ("corners_plus1", "corners_plus2")
@@ -86,7 +86,7 @@ class SharpMesh:
         t = self.topology
         arrays = (t.edge_names, t.face_sizes, t.face_vertices, self.tags.edges, self.tags.vertices, self.holes)
         rules = (self.boundary, self.crease_method, self.triangle_rule, self.face_varying)
-        return _SHARED.get((t.vertex_count, *map(Content, arrays), *rules), lambda: self)
+        return shared_by_key((SharpMesh, t.vertex_count, *map(Content, arrays), *rules), lambda: self)
 
     @cached_property
     def is_corner(self) -> NDArray[np.bool_]:
@@ -138,9 +138,6 @@ class SharpMesh:
             at_boundary = t.ends_of(self.is_boundary & ~self.tags.is_infinite)
             is_hole[t.face[np.flatnonzero(at_boundary[t.face_vertices])]] = True
         return is_hole
-
-
-_SHARED: Shared[SharpMesh] = Shared()
 
 
 def _vertex_rules(mesh: SharpMesh, is_cut: NDArray[np.bool_], is_border: NDArray[np.bool_]) -> NDArray[np.int8]:

@@ -6,13 +6,19 @@ import zlib
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 from threading import Lock, RLock
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 Value = TypeVar("Value")
+
+_values: WeakValueDictionary[Hashable, Any] = WeakValueDictionary()
+# A lock for each value in creation. If several threads request a value, one creates it and the others wait. Requests
+# for other values are not blocked. After an error several threads may create the value.
+_making: dict[Hashable, RLock] = {}
+_lock = Lock()
 
 
 class Content:
@@ -41,48 +47,34 @@ class Content:
 
 @dataclass(frozen=True, eq=False)
 class SharedArray:
-    """An array as a value of `Shared`: on a device, or a NumPy array."""
+    """An array as a shared value: on a device, or a NumPy array."""
 
     array: Any
 
 
-class Shared(Generic[Value]):
-    """Cache of values that are created at their first use and kept while they are referenced elsewhere."""
-
-    def __init__(self) -> None:
-        self._values: WeakValueDictionary[Hashable, Any] = WeakValueDictionary()
-        # A lock for each value in creation. If several threads request a value, one creates it and the others wait.
-        # Requests for other values are not blocked. After an error several threads may create the value.
-        self._making: dict[Hashable, RLock] = {}
-        self._lock = Lock()
-
-    def get(
-        self,
-        key: Hashable,  # Determines the value. It is kept as long as the value.
-        # Creates the value. It may request other values. It must not wait for Dr.Jit, which may meanwhile start
-        # other work that requests the same value.
-        make: Callable[[], Value],
-    ) -> Value:
-        """Return the value of a key; the first call creates it."""
-        with self._lock:
-            value = self._values.get(key)
-            if value is not None:
-                return value
-            making = self._making.setdefault(key, RLock())
-        with making:
-            value = self._values.get(key)
-            try:
-                if value is None:
-                    value = self._values[key] = make()
-                return value
-            finally:
-                with self._lock:
-                    self._making.pop(key, None)
-
-
-_OBJECTS: Shared[Any] = Shared()
-
-
 def shared(kind: Callable[..., Value], *arguments: Hashable) -> Value:
     """Return ``kind(*arguments)``, which is made once for equal arguments and shared while it is referenced."""
-    return _OBJECTS.get((kind, *arguments), lambda: kind(*arguments))
+    return shared_by_key((kind, *arguments), lambda: kind(*arguments))
+
+
+def shared_by_key(
+    key: Hashable,  # Determines the value, and begins with its type. It is kept as long as the value.
+    # Creates the value. It may request other values. It must not wait for Dr.Jit, which may meanwhile start other work
+    # that requests the same value.
+    make: Callable[[], Value],
+) -> Value:
+    """Return the value of a key; the first call creates it, and it is kept while it is referenced elsewhere."""
+    with _lock:
+        value = _values.get(key)
+        if value is not None:
+            return value
+        making = _making.setdefault(key, RLock())
+    with making:
+        value = _values.get(key)
+        try:
+            if value is None:
+                value = _values[key] = make()
+            return value
+        finally:
+            with _lock:
+                _making.pop(key, None)

@@ -14,7 +14,7 @@ from ..cage.contents import Attribute
 from ..evaluation.located_samples import limit_stencils
 from ..mesh.connectivity import IntArray, Topology, VertexRule
 from ..mesh.cuts import seams
-from ..mesh.shared import Content, Shared
+from ..mesh.shared import Content, shared_by_key
 from ..refinement.adapted_scheme import subdivided_values
 from ..schemes import Scheme
 from ..schemes.domain import FloatArray
@@ -56,11 +56,8 @@ class ChannelLayout:
         patches: PatchTable,  # Of the cage's surface; shared by attributes that are subdivided on the same mesh
     ) -> ChannelLayout:
         """Choose the interpolation of an attribute. Raises SchemeError if the scheme has no rules for it."""
-        key = cage.structure, scheme, attribute.interpolation, Content(attribute.indices)
-        return _LAYOUTS.get(key, lambda: _layout_of(name, attribute, cage, scheme, patches))
-
-
-_LAYOUTS: Shared[ChannelLayout] = Shared()
+        key = cls, cage.structure, scheme, attribute.interpolation, Content(attribute.indices)
+        return shared_by_key(key, lambda: _layout_of(name, attribute, cage, scheme, patches))
 
 
 @dataclass(frozen=True, eq=False)

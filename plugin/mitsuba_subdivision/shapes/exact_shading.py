@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import mitsuba as mi
@@ -12,19 +12,18 @@ import numpy as np
 
 from ..kernels.algebra import AffineMap, added, dot, over
 from ..kernels.array_types import Float, Index, IndexBuffer, Mask, Matrix4, Value, Vector2, Vector3
-from ..kernels.channel_kernel import ChannelKernel
 from ..kernels.line_intersection import ON_LINE, Lines
 from ..kernels.locations import Location, TriangleLocations
 from ..kernels.surface_kernel import SurfaceKernel, SurfacePoints
 from ..mesh.shared import shared
 from ..surface import TEXCOORDS
 from ..variants import Variant
-from .cage_attributes import WIDTHS, mesh_name, spectral_upsampling
+from .cage_attributes import mesh_name, spectral_upsampling
 from .outlines import turn_to_seen
 from .placement import Placement
 
 if TYPE_CHECKING:
-    from ..surface import LimitSurface
+    from ..kernels.channel_kernel import ChannelKernel
     from .mesh_buffers import Triangles
 
 # Length of the rays to points of outlines, in which projective integrators compute the radiance beside these.
@@ -41,30 +40,6 @@ _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 # Number of fixed-point iterations of `ExactShading.hit_by_texcoords`. Each removes most of the difference between
 # texture coordinates on the surface and on its triangles.
 STEPS = 3
-
-
-class TriangleHit(NamedTuple):
-    """Arguments of `mi.Shape.compute_surface_interaction`."""
-
-    ray: mi.Ray3f
-    preliminary: mi.PreliminaryIntersection3f
-    flags: int  # `mi.RayFlags`
-    active: Mask
-
-
-def channels_at_hits(surface: LimitSurface, float_type: type) -> dict[str, ChannelKernel]:
-    """Texture coordinates and attributes that are evaluated at hits, by their names in the cage."""
-    channels = {name: surface.channel(name) for name in surface.attribute_names}
-    kernels = {
-        name: ChannelKernel(channel, float_type)
-        for name, channel in channels.items()
-        if name == TEXCOORDS or channel.values.shape[1] in WIDTHS
-    }
-    for layout in {channel.layout for channel in channels.values()}:
-        # Values with seams have a mesh of their own.
-        if layout.patches is not surface.patches:
-            layout.patches.forget()
-    return kernels
 
 
 class ExactShading:
@@ -128,9 +103,16 @@ class ExactShading:
         for name, channel in self.channels.items():
             callback.put(f"shading_cage_{name}", channel.values.flat, differentiable)
 
-    def complete(self, si: mi.SurfaceInteraction3f, triangle_hit: TriangleHit) -> None:
+    def complete(
+        self,
+        si: mi.SurfaceInteraction3f,
+        # Arguments of `mi.Shape.compute_surface_interaction`
+        ray: mi.Ray3f,
+        preliminary: mi.PreliminaryIntersection3f,
+        flags: int,  # `mi.RayFlags`
+        active: Mask,
+    ) -> None:
         """Complete the surface interaction at a hit on a triangle, in place."""
-        ray, preliminary, flags, active = triangle_hit
         kernel, vector3 = self.kernel, self.kernel.types.vector3
         b1, b2 = dr.detach(preliminary.prim_uv)
         if self._are_turned:

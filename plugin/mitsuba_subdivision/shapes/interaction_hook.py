@@ -34,7 +34,6 @@ import mitsuba as mi
 from ..kernels.array_types import Mask, Value
 from ..variants import Variant, variant_name
 from .device_state import DeferredCollection, traversed
-from .exact_shading import TriangleHit
 from .machine_code import (
     BEFORE,
     address_of,
@@ -160,7 +159,8 @@ class InteractionHook:
             index = _index_of(entries, f"eval_attribute{suffix}", _ATTRIBUTE_ARGUMENTS)
             entries[index] = calling_after(entries[index], result_type, self._attribute(result_type, sizes))
         self._table = (ctypes.c_void_p * len(entries))(*entries)
-        problem = trial_problem(variant, triangle, self.attach)
+        self.attach(triangle, triangle)
+        problem = trial_problem(variant, triangle)
         if problem is not None:
             raise RuntimeError(f"needs the virtual functions of Mitsuba 3.9; of those of {mi.__version__}, {problem}")
         self._tag_groups()
@@ -188,13 +188,13 @@ class InteractionHook:
             return
         variant = self._variant
         with _collection.while_tracing():
-            hit = TriangleHit(
+            answers.complete(
+                object_at(variant.SurfaceInteraction3f, result),
                 object_at(variant.Ray3f, ray),
                 object_at(variant.PreliminaryIntersection3f, preliminary),
                 flags & _FLAGS,
                 object_at(variant.Mask, active),
             )
-            answers.complete(object_at(variant.SurfaceInteraction3f, result), hit)
 
     def _turn_outline(self, result: int, this: int, _sample: int, _flags: int, active: int, *_: int) -> None:
         """Override of ``sample_silhouette``, called with its result and its arguments."""
@@ -266,59 +266,27 @@ def _index_of(entries: list[int], function: str, arguments: str) -> int:
 # expected. It must not wait for Dr.Jit: during a wait, Mitsuba may load another shape on the same stack.
 
 
-class Trial:
-    """Overrides that record their arguments, and return known results."""
-
-    def __init__(self, variant: Variant) -> None:
-        self._variant = variant
-        self.asked: list[Any] = []
-
-    def complete(self, si: mi.SurfaceInteraction3f, hit: TriangleHit) -> None:
-        """As `ExactShading.complete`."""
-        self.asked = _asked(hit)
-        si.uv = self._variant.Point2f(*_ANSWERED_UV)
-
-    def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value | None:
-        """As `ExactShading.attribute`. Scenes that other threads render ask for attributes of other names."""
-        if name not in _ATTRIBUTES:
-            return None
-        self.asked = _identity(name, si.t, active)
-        return self._variant.Float(_VALUE[0]) if _ATTRIBUTES[name] == 1 else self._variant.Color3f(*_VALUE)
-
-    def turn_outline(self, ss: mi.SilhouetteSample3f, active: Mask) -> None:
-        """As `ExactShading.turn_outline`."""
-        self.asked = _identity(active)
-        ss.uv = self._variant.Point2f(*_ANSWERED_UV)
-
-
 def trial_problem(
     variant: Variant,
-    shape: mi.Mesh,  # Made by `_triangle`
-    attach: Callable[[mi.Mesh, Trial], None],  # Hooks the functions of a shape
+    triangle: Any,  # Made by `_triangle`, with its functions hooked
 ) -> str | None:
     """Return how Mitsuba's virtual functions differ from the expected ones; None if they do not."""
-    trial = Trial(variant)
-    attach(shape, trial)
     ray = variant.Ray3f(variant.Point3f(*_ORIGIN), variant.Vector3f(*_DIRECTION))
     preliminary, si = dr.zeros(variant.PreliminaryIntersection3f), dr.zeros(variant.SurfaceInteraction3f)
     preliminary.t, preliminary.prim_uv = variant.Float(_DISTANCE), variant.Point2f(*_UV)
     si.t, active = variant.Float(_DISTANCE), variant.Mask(True)
-    hit = TriangleHit(ray, preliminary, int(mi.RayFlags.UV), active)
+    hit, uv = (ray, preliminary, int(mi.RayFlags.UV), active), variant.Point2f(*_ANSWERED_UV)
+    of_hit = _identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, *hit[2:])
     of_one, of_three = (_identity(name, si.t, active) for name in _ATTRIBUTES)
     for function, arguments, asked, value in (
-        (shape.compute_surface_interaction, hit, _asked(hit), variant.Point2f(*_ANSWERED_UV)),
-        (
-            shape.sample_silhouette,
-            (variant.Point3f(*_ORIGIN), 0, active),
-            _identity(active),
-            variant.Point2f(*_ANSWERED_UV),
-        ),
-        (shape.eval_attribute, ("face_one", si, active), of_one, variant.UnpolarizedSpectrum(_VALUE[0])),
-        (shape.eval_attribute_1, ("face_one", si, active), of_one, variant.Float(_VALUE[0])),
-        (shape.eval_attribute_3, ("face_three", si, active), of_three, variant.Color3f(*_VALUE)),
+        (triangle.compute_surface_interaction, hit, of_hit, uv),
+        (triangle.sample_silhouette, (variant.Point3f(*_ORIGIN), 0, active), _identity(active), uv),
+        (triangle.eval_attribute, ("face_one", si, active), of_one, variant.UnpolarizedSpectrum(_VALUE[0])),
+        (triangle.eval_attribute_1, ("face_one", si, active), of_one, variant.Float(_VALUE[0])),
+        (triangle.eval_attribute_3, ("face_three", si, active), of_three, variant.Color3f(*_VALUE)),
     ):
         result = function(*arguments)
-        if trial.asked != asked or _identity(getattr(result, "uv", result)) != _identity(value):
+        if triangle.asked != asked or _identity(getattr(result, "uv", result)) != _identity(value):
             return f"{function.__name__} does not pass on its arguments, or its result"
     return None
 
@@ -326,9 +294,32 @@ def trial_problem(
 def _triangle(variant: Variant) -> mi.Mesh:
     # Derived in Python like the shapes, because a C++ class has another table of virtual functions.
     class Triangle(variant.Mesh):
-        """Mesh derived in Python."""
+        """Mesh whose overrides, those of `ExactShading`, record their arguments and return known results."""
+
+        def complete(
+            self,
+            si: mi.SurfaceInteraction3f,
+            ray: mi.Ray3f,
+            preliminary: mi.PreliminaryIntersection3f,
+            flags: int,
+            active: Mask,
+        ) -> None:
+            self.asked = _identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, flags, active)
+            si.uv = variant.Point2f(*_ANSWERED_UV)
+
+        def attribute(self, name: str, si: mi.SurfaceInteraction3f, active: Mask) -> Value | None:
+            # Scenes that other threads render ask for attributes of other names.
+            if name not in _ATTRIBUTES:
+                return None
+            self.asked = _identity(name, si.t, active)
+            return variant.Float(_VALUE[0]) if _ATTRIBUTES[name] == 1 else variant.Color3f(*_VALUE)
+
+        def turn_outline(self, ss: mi.SilhouetteSample3f, active: Mask) -> None:
+            self.asked = _identity(active)
+            ss.uv = variant.Point2f(*_ANSWERED_UV)
 
     mesh = Triangle("triangle", vertex_count=3, face_count=1)
+    mesh.asked = []
     for name, size in _ATTRIBUTES.items():
         mesh.add_attribute(name, size, [0.0] * size)
     for name, value, cpp_type in traversed(variant, mesh.traverse):
@@ -336,11 +327,6 @@ def _triangle(variant: Variant) -> mi.Mesh:
             # Zeros would result in an interaction of zeros.
             variant.set_property(value, cpp_type, variant.Float([1, 2, 3, 4, 6, 5, 9, 7, 8]))
     return mesh
-
-
-def _asked(hit: TriangleHit) -> list[Any]:
-    ray, preliminary, flags, active = hit
-    return _identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, active, flags)
 
 
 def _identity(*values: Any) -> list[Any]:

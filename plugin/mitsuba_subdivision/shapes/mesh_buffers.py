@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..device_arrays import mapped
 from ..kernels.array_types import ArrayTypes, FloatBuffer, IndexBuffer, LaterArrays
 from ..mesh.connectivity import IntArray
-from ..mesh.shared import Content, Shared, SharedArray, shared
+from ..mesh.shared import Content, SharedArray, shared, shared_by_key
 from ..surface import LimitSurface
 from ..variants import Variant
 from .derivatives import BackwardPasses
@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from .exact_shading import ExactShading
     from .parameters import Parameters
 
-# Vertices of loaded control points in object space, shared by shapes of equal cages, and their largest number: few take
-# longer to trace than to compute, and more take memory.
-_LOADED: Shared[LaterArrays] = Shared()
+# Largest number of vertices of loaded control points that shapes of equal cages share, in object space: few take longer
+# to trace than to compute, and more take memory.
 MOST_SHARED = 1 << 14
 
 
@@ -90,7 +89,8 @@ class MeshBuffers:
         # Used by the first evaluation alone, and kept alive for those of other shapes; None if vertices are not shared.
         self._loaded: LaterArrays | None = None
         if not self._is_sampled and table.vertex_count <= MOST_SHARED:
-            self._loaded = _LOADED.get((self._kernel or table, self._parameters.surface.cage), LaterArrays)
+            key = LaterArrays, self._kernel or table, self._parameters.surface.cage
+            self._loaded = shared_by_key(key, LaterArrays)
         self._is_loaded = True
         # Index of each vertex of the mesh among those of the tessellation, if seams have copies
         copied = layout.surface_vertex

@@ -25,7 +25,7 @@ from ..evaluation.equations import Evaluator
 from ..files.formats import FORMATS
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from ..mesh.shared import Shared
+from ..mesh.shared import shared_by_key
 from ..surface import TEXCOORDS, LimitSurface
 from .cage_attributes import RESERVED
 from .parameter_table import PARAMETER_OF_NAME, errors_about, value_of
@@ -51,7 +51,6 @@ _OBJECTS = (mi.Properties.Type.Object, mi.Properties.Type.ResolvedReference, mi.
 # Minimum age in nanoseconds of a file whose cage is shared. Later changes of a younger file may not change its
 # modification time, whose resolution is some milliseconds, or two seconds on some systems.
 SETTLED = 2_000_000_000
-_CAGES: Shared[ControlCage] = Shared()
 # Warnings that were issued when each cage was built. They are repeated for each shape.
 _WARNINGS: WeakKeyDictionary[ControlCage, list[str]] = WeakKeyDictionary()
 
@@ -408,7 +407,7 @@ def _shared(key: Hashable, make: Callable[..., ControlCage], *arguments: Any, **
         _WARNINGS[cage] = noted
         return cage
 
-    cage = _CAGES.get(key, made)
+    cage = shared_by_key((ControlCage, key), made)
     for message in _WARNINGS[cage]:
         warn(message)
     return cage

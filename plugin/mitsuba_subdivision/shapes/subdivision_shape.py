@@ -15,7 +15,7 @@ from ..kernels.array_types import Float, FloatBuffer, Index, IndexBuffer, Mask, 
 from ..llvm import require_llvm
 from ..surface import TEXCOORDS
 from ..variants import Variant
-from .cage_attributes import PREFIX, CageAttributes, mesh_attributes, mesh_name
+from .cage_attributes import PREFIX, CageAttributes, channels_at_hits, mesh_attributes, mesh_name
 from .device_state import DeviceState, flat_type, is_recording, paused_collection, require_values, traversed
 from .mesh_buffers import MeshBuffers, Triangles
 from .outlines import seen_edges
@@ -92,9 +92,7 @@ def make_subdivision(
                 on_device = SurfaceKernel(surface.pieces(), variant.Float)
                 on_device.values.load(self._placement.positions)
             channels: dict[str, ChannelKernel] = {}
-            if is_exact:
-                from .exact_shading import channels_at_hits
-
+            if is_exact and surface.attribute_names:
                 channels = channels_at_hits(surface, variant.Float)
             self._displacement: ShapeDisplacement | None = None
             if parameters.displacement is not None:

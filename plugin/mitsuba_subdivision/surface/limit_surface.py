@@ -16,7 +16,7 @@ from ..cage.errors import CageError
 from ..evaluation.element import SurfaceSamples, derivative_stencils
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..evaluation.located_samples import limit_stencils
-from ..mesh.shared import Shared
+from ..mesh.shared import shared_by_key
 from ..patches.area_samples import AreaSamples, SamplingCells, surface_areas, uniform_locations
 from ..patches.channel import Channel, ChannelLayout
 from ..patches.closest_points import ClosestPoints, ClosestPointSearch
@@ -45,9 +45,6 @@ if TYPE_CHECKING:
 
 # Name of the texture coordinates among the attributes.
 TEXCOORDS = "texcoords"
-
-# Patch tables by the structure of the cage and the scheme.
-_PATCHES: Shared[PatchTable] = Shared()
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +108,7 @@ class LimitSurface:
             # Sharpness at a non-manifold vertex has no meaning where vertices do not stay.
             return PatchTable(cut.topology.with_rules(None, None), self.scheme, None, cut.vertex, count)
 
-        return _PATCHES.get((self.cage.structure, self.scheme), make)
+        return shared_by_key((PatchTable, self.cage.structure, self.scheme), make)
 
     def evaluate(
         self,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
-from ..mesh.shared import Content, Shared, shared
+from ..mesh.shared import Content, shared, shared_by_key
 from ..patches.patch_table import PatchTable
 from ..schemes.domain import FloatArray
 from .uniform import uniform_table
@@ -99,10 +99,7 @@ class AttributeTable:
         layouts = tuple(channel.layout for channel in channels.values())
         layout, values = shared(AttributeLayout, table, patches, layouts), {}
         for name, channel in channels.items():
-            key = layout, channel.layout, Content(channel.values)
-            values[name] = _VALUES.get(key, partial(layout.evaluated, channel))
+            key = AttributeTable, layout, channel.layout, Content(channel.values)
+            values[name] = shared_by_key(key, partial(layout.evaluated, channel))
             values[name].flags.writeable = False
         return cls(layout, values)
-
-
-_VALUES: Shared[FloatArray] = Shared()
