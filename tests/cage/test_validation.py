@@ -11,7 +11,7 @@ from mitsuba_subdivision.cage.errors import CageSource, in_digits, warn
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.files.formats import warn_of_losses
 from patches.closed_cages import tetrahedron, torus
-from reference.refined_cages import tagged
+from reference.refined_cages import sheet, tagged
 
 POINTS = np.random.default_rng(1).random((9, 3))
 NAN, INF = float("nan"), float("inf")
@@ -145,8 +145,10 @@ def test_tags_reach_both_half_edges_and_no_other_and_the_last_of_equal_ones_coun
     assert np.count_nonzero(expected) == 4
     np.testing.assert_array_equal(cage.tags.edges, expected)
     np.testing.assert_array_equal(cage.tags.vertices, 2.5 * (np.arange(8) == 7))
-    cage = tagged(cube(), creases=[(0, 1, 3), (1, 0, 4), (0, 1, 5), (1, 0, 2)])
-    np.testing.assert_array_equal(cage.tags.creases(cage.topology)[:, 2], [2])
+    # An edge on a border has one half-edge only.
+    for plain in (cube(), sheet(2, 2)):
+        cage = tagged(plain, creases=[(0, 1, 3), (1, 0, 4), (0, 1, 5), (1, 0, 2)])
+        np.testing.assert_array_equal(cage.tags.creases(cage.topology)[:, 2], [2])
 
 
 def test_creases_of_large_cages_are_found():

@@ -12,7 +12,7 @@ from scipy.special import chdtrc
 
 NAMES = ["mixed torus", "half disc of 6", "crease", "loop mixed torus", "loop corner", "doo_sabin mixed torus"]
 SIGNIFICANCE = 1e-3
-COUNT = 20_000
+COUNT = 10_000
 # Cells on each side of an element, and parts of a cell that are evaluated to measure it.
 CELLS, PARTS = 4, 2
 
@@ -60,7 +60,7 @@ def test_points_are_uniform_inside_elements(name):
     bounds = surface.bounds()
     element = int(bounds.element[np.linalg.norm(bounds.upper - bounds.lower, axis=1).argmax()])
     # What `sample` evaluates, of which there have to be many for enough of them to lie in one element.
-    start, uv = uniform_locations(surface._surface_pieces, surface._areas[0], 5 * COUNT, np.random.default_rng(2))
+    start, uv = uniform_locations(surface._surface_pieces, surface._areas[0], 8 * COUNT, np.random.default_rng(2))
     elements, corners = surface._element_and_corner(start)
     own = elements == element
     if surface.patches.is_whole[element]:

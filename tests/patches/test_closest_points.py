@@ -114,13 +114,13 @@ def test_nearest_points_of_a_flat_sheet_are_projections():
 @pytest.mark.parametrize("name", ["valence 3", "valence 50", "dart", "loop valence 3", "doo_sabin mixed torus"])
 def test_points_above_places_at_and_next_to_extraordinary_ones(name, np_rng):
     surface = surface_named(name)
-    deep = np.repeat([2.0**-8, 2.0**-20, 2.0**-40, 0], 3)[:, None]
+    deep = np.repeat([2.0**-8, 2.0**-40, 0], 2)[:, None]
     domain = surface.scheme.domain
     uv = deep * (np_rng.dirichlet(np.ones(domain.corner_count), len(deep)) @ domain.corners)
     element = 0 if surface.scheme.element == "face" else int(np.argmax(surface.patches.elements.face_sizes != 4))
     samples = surface.evaluate(element, uv)
-    heights = np.repeat([0.0, 1e-12, 1e-6, 1e-3], len(uv))
-    points = np.tile(samples.p, (4, 1)) + heights[:, None] * np.tile(samples.n, (4, 1))
+    heights = np.repeat([0.0, 1e-9, 1e-3], len(uv))
+    points = np.tile(samples.p, (3, 1)) + heights[:, None] * np.tile(samples.n, (3, 1))
     assert (surface.closest_point(points).distance <= heights + ROUNDED).all()
 
 

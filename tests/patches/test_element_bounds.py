@@ -32,7 +32,7 @@ def assert_contained(surface, np_rng, count=SAMPLES):
 
 @pytest.mark.parametrize("name", SURFACES)
 def test_boxes_contain_the_surface_in_both_precisions(name, np_rng):
-    assert_contained(surface_named(name), np_rng, 100_000 if name in MANY_SAMPLES else SAMPLES)
+    assert_contained(surface_named(name), np_rng, 30_000 if name in MANY_SAMPLES else SAMPLES)
 
 
 @pytest.mark.parametrize("name", ["cube", "loop valence 3", "doo_sabin mixed torus"])

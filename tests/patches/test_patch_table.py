@@ -20,8 +20,8 @@ def patch_table(scheme, cage):
     return LimitSurface(cage, scheme).patches
 
 
-def signature_of(table, corner):
-    return signatures_at(table.topology, table.half_edge_of_corner[[corner]], table.scheme.element)[0]
+def signatures_of(table, corners):
+    return signatures_at(table.topology, table.half_edge_of_corner[corners], table.scheme.element)
 
 
 def turns(signature, corner_count):
@@ -40,7 +40,7 @@ def test_classes_group_patches_by_signature_and_one_ring(scheme, cage):
     table = patch_table(scheme, cage)
     for patch_class in table.classes:
         assert len(set(table.is_whole[table.elements.face[patch_class.corners]])) == 1
-        assert {signature_of(table, corner) for corner in patch_class.corners} == {patch_class.signature}
+        assert {*signatures_of(table, patch_class.corners)} == {patch_class.signature}
         ring = one_ring(patch_class.signature)
         assert patch_class.controls.shape == (len(patch_class.corners), ring.vertex_count)
         half_edges = table.half_edge_of_corner[patch_class.corners]
@@ -64,7 +64,7 @@ def test_patches_of_a_class_see_the_same_near_faces_of_large_fans(scheme):
         centre += 2 * count + 2
     table = PatchTable(mesh_of(centre, faces), scheme_named(scheme))
     for patch_class in table.classes:
-        assert {signature_of(table, corner).near() for corner in patch_class.corners} == {patch_class.signature}
+        assert {each.near() for each in signatures_of(table, patch_class.corners)} == {patch_class.signature}
         start, end = table.topology.border_neighbours(table.topology.face_vertices[patch_class.corners])
         for controls, ends in zip(patch_class.controls, zip(start, end, strict=True), strict=True):
             assert {*ends} <= {*controls}

@@ -127,7 +127,8 @@ def test_options_of_maps(texture, statement, expected):
 def test_pixels_are_blended_unless_that_is_off(texture):
     between = [0.45, 0.75]
     assert at(texture(f"map_Kd {NAME}"), between) == pytest.approx([0.6], abs=1e-3)
-    assert at(texture(f"map_Kd -blendu off {NAME}"), between) == pytest.approx([1], abs=1e-3)
+    for off in ("-blendu off", "-blendu off -blendv on", "-blendv off"):
+        assert at(texture(f"map_Kd {off} {NAME}"), between) == pytest.approx([1], abs=1e-3)
 
 
 def test_options_without_meaning_here_are_told(texture):
