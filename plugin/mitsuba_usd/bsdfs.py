@@ -13,13 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from .contents import Input, MaterialContents, NodeContents, PrimvarContents, ShapeContents, TextureContents, leaves
 from .materialx_nodes import LUMINANCE, PLUGIN, constant, is_all, is_constant, node, width_of
 from .stage_warnings import StageWarnings
-from .surface_models import NEUTRAL, conductor, has_white_edges, number, with_shape
+from .surface_models import NEUTRAL, conductor, conductor_reflectance, has_white_edges, number, with_shape
 from .textures import Textures
 
 GREY = [0.5, 0.5, 0.5]  # Default displayColor of USD's viewers
-_DULL, _GLOSSY = 0.1, 0.001  # Width of the lobe of `principled` where clearcoat_gloss is 0, and where it is 1
 _MOST_ETA = 1000.0  # Largest index of refraction; nearly all light is reflected
-_COAT = 0.04  # Reflectance of the coat of `principled` at normal incidence
+_COSINES = np.sqrt((np.arange(64) + 0.5) / 64)  # Of angles of incidence of equal parts of uniform light
 _MIRROR = 0.001  # Width of the narrowest lobe of `principled`, at the limit of float32; narrower lobes are mirrors
 _LEAST_ETA = 1.001  # With an index of 1, `principled` loses its metal
 # Inputs that Mitsuba's BSDFs need between 0 and 1; plain images and primvars are kept.
@@ -183,11 +182,23 @@ class _Surface:
         else:
             parts = {"bsdf_0": self._opaque(), "bsdf_1": self._with_normal_map(self._glass(), is_diffuse=False)}
             entry = {"type": "blendbsdf", "weight": self.number(weight), **parts}
-        return _masked(entry, self.number(self._inputs["opacity"]))
+        return _masked(self._coated(entry), self.number(self._inputs["opacity"]))
 
-    def _with_normal_map(self, bsdf: SceneNode, *, is_diffuse: bool = True) -> SceneNode:
-        """A BSDF with the normal map, if there is one."""
-        normal = self._for_shape(self._inputs.get("normal", 0.0))
+    def _coated(self, entry: SceneNode) -> SceneNode:
+        """A BSDF below the coat, which reflects as a dielectric at each angle and dims what lies below by its mean."""
+        if self._is("coat", 0) or (eta := _index(self._reflectance("coat_ior"))) == 1:
+            return entry
+        mean = float(conductor_reflectance(eta, 0, _COSINES).mean())
+        # A conductor without absorption is a dielectric that only reflects.
+        # Never a mirror, which would not show the highlights of lights without size.
+        lobe = _conductor(eta, 0.0, self._widths("coat_roughness", None) or {"alpha": _MIRROR})
+        coat = self._with_normal_map({**lobe, "specular_reflectance": 1 / mean}, "coat_normal", is_diffuse=False)
+        weight = self.number(number("multiply", self._inputs["coat"], mean))
+        return {"type": "blendbsdf", "weight": weight, "bsdf_0": entry, "bsdf_1": _both_sides(coat)}
+
+    def _with_normal_map(self, bsdf: SceneNode, name: str = "normal", *, is_diffuse: bool = True) -> SceneNode:
+        """A BSDF with a normal map, if there is one."""
+        normal = self._for_shape(self._inputs.get(name, 0.0))
         normals = self._textures.normals(normal) if isinstance(normal, (TextureContents, NodeContents)) else None
         if normals is None:
             return bsdf
@@ -199,7 +210,7 @@ class _Surface:
     def _opaque(self) -> SceneNode:
         if not self._is("translucency", 0):
             return self._with_normal_map(self._sheet(0.0))
-        is_bare = self._is("coat", 0) and self._is("sheen", 0)
+        is_bare = self._is("sheen", 0)
         if is_bare and self._is("metalness", 1) and is_constant(self._inputs["base_color"]):
             return _both_sides(self._with_normal_map(self._metal(), is_diffuse=False))
         if is_bare and self._is("metalness", 0) and (self._is("specular", 0) or self._is("specular_color", 0)):
@@ -217,15 +228,11 @@ class _Surface:
             "metallic": self.number(inputs["metalness"]),
         }
         if not (self._is("metalness", 0) or has_white_edges(inputs["base_color"], inputs["edge_color"])):
-            self._note("edge colours of metals with textures, coats or other layers are ignored; the edges are white")
+            self._note("edge colours of metals with textures or other layers are ignored; the edges are white")
         ratio = self._ratio()
         if ratio is not None:
             rest = node("invert", "float", in_=ratio, amount=1.0)  # The ratio of widths is 1 - 0.9 anisotropic
             entry["anisotropic"] = self.number(number("divide", rest, 0.9))
-        if not self._is("coat", 0):
-            factor = self._reflectance("coat_ior") / _COAT
-            entry["clearcoat"] = self.number(number("multiply", inputs["coat"], factor))
-            entry["clearcoat_gloss"] = self._gloss()
         if not self._is("sheen", 0):
             color = np.broadcast_to(self._mean("sheen_color"), (3,))
             brightness = float(color @ LUMINANCE)
@@ -234,22 +241,9 @@ class _Surface:
                 self._note("colours of sheen only set its brightness; it is white")
         return entry
 
-    def _gloss(self) -> SceneNode | float:
-        """``clearcoat_gloss`` of a roughness, whose square is the width of the lobe."""
-        roughness = self._inputs["coat_roughness"]
-        if np.any(np.square(self._mean("coat_roughness")) > _DULL):
-            self._note(f"coats rougher than {_DULL**0.5:.2f} are rendered with that roughness")
-        width = number("multiply", roughness, roughness)
-        gloss = node("divide", "float", in1=node("invert", "float", in_=width, amount=_DULL), in2=_DULL - _GLOSSY)
-        return self.number(node("clamp", "float", in_=gloss, low=0.0, high=1.0))
-
     def _metal(self) -> SceneNode:
         n, k = conductor(constant(self._inputs["base_color"], 3), self._mean("edge_color"))
-        optics = {"eta": rgb(np.broadcast_to(n, (3,))), "k": rgb(np.broadcast_to(k, (3,)))}
-        widths = self._widths()
-        if widths is None:
-            return {"type": "conductor", **optics}
-        return {"type": "roughconductor", "distribution": "ggx", **optics, **widths}
+        return _conductor(rgb(n), rgb(k), self._widths("roughness", self._ratio()))
 
     def _glass(self) -> SceneNode:
         if not self._is("thin", 0):
@@ -260,14 +254,14 @@ class _Surface:
             "ext_ior": 1.0,
             "specular_transmittance": self._color(self._inputs["transmission_color"]),
         }
-        widths = self._widths()
+        widths = None if self._is("clear", 1) else self._widths("roughness", self._ratio())
         if widths is None:
             return {"type": "dielectric", **entry}
         return {"type": "roughdielectric", "distribution": "ggx", **entry, **widths}
 
     def _sheet(self, transmission: float) -> SceneNode:
         inputs = self._inputs
-        if transmission == 1 and self._widths() is None:
+        if transmission == 1 and self._widths("roughness", None) is None:
             color = self._color(inputs["transmission_color"])
             indices = {"int_ior": self._eta(), "ext_ior": 1.0}
             return {"type": "thindielectric", **indices, "specular_transmittance": color}
@@ -296,8 +290,7 @@ class _Surface:
         if not (is_constant(self._inputs["specular"]) and is_constant(self._inputs["specular_color"])):
             self._note("textures of specular weights and colours are replaced by their means")
         factor = _first(self._mean("specular")) * float(color @ LUMINANCE)
-        root = np.sqrt(np.clip(self._reflectance("ior") * factor, 0, 0.998))
-        return float((1 + root) / (1 - root))
+        return _index(self._reflectance("ior") * factor)
 
     def _ratio(self) -> Input | None:
         """Ratio of the lobe's width along v to that along u; None if it is 1."""
@@ -310,19 +303,30 @@ class _Surface:
             self._note("rotations of anisotropy are rounded to quarter turns")
         return number("divide", 1.0, ratio) if round(quarters) % 2 else ratio
 
-    def _widths(self) -> SceneNode | None:
-        """Widths of a GGX lobe; None for a mirror."""
-        roughness = self._inputs["roughness"]
+    def _widths(self, name: str, ratio: Input | None) -> SceneNode | None:
+        """Widths of a GGX lobe, by an input and the ratio of widths; None for a mirror."""
+        roughness = self._inputs[name]
         width = number("multiply", roughness, roughness)
         if is_constant(width) and _first(width) < _MIRROR:
             return None
         width = number("max", width, _MIRROR)
-        ratio = self._ratio()
         if ratio is None:
             return {"alpha": self.number(width)}
         root = number("power", ratio, 0.5)
         u, v = (number("min", number(category, width, root), 1.0) for category in ("divide", "multiply"))
         return {"alpha_u": self.number(u), "alpha_v": self.number(v)}
+
+
+def _conductor(eta: Any, k: Any, widths: SceneNode | None) -> SceneNode:
+    if widths is None:
+        return {"type": "conductor", "eta": eta, "k": k}
+    return {"type": "roughconductor", "distribution": "ggx", "eta": eta, "k": k, **widths}
+
+
+def _index(reflectance: float) -> float:
+    """Index of refraction above 1 with a reflectance at normal incidence."""
+    root = np.sqrt(np.clip(reflectance, 0, 0.998))
+    return float((1 + root) / (1 - root))
 
 
 def _attribute(given: PrimvarContents) -> SceneNode:

@@ -32,6 +32,7 @@ NEUTRAL: dict[str, Input] = {
     "anisotropy": 0.0,  # 1 less the ratio of the two widths of the lobe; their product is that of the roughness.
     "rotation": 0.0,  # Turns from u to the wider direction, counter-clockwise.
     "transmission": 0.0,
+    "clear": 0.0,  # 1 for transmission without roughness.
     "transmission_color": WHITE,  # Transmittance of the surface, at each side of a body.
     "depth_color": WHITE,  # Transmittance of the interior along a path of the depth.
     "depth": 0.0,  # 0 for a body that does not absorb.
@@ -48,11 +49,16 @@ NEUTRAL: dict[str, Input] = {
 
 
 def material(name: str, model: str, given: Mapping[str, Input]) -> MaterialContents:
-    """A material from all inputs of its model; ``normal`` is in tangent space, from -1 to 1."""
+    """A material from all inputs of its model; normals are in tangent space, from -1 to 1."""
     shared = MODELS[model](lambda input_name: given.get(input_name, 0.0))
     inputs = {key: value for key, value in shared.items() if not (is_constant(value) and value == NEUTRAL[key])}
-    normal = given.get("normal", given.get("geometry_normal", 0.0))
-    return MaterialContents(name, inputs if is_constant(normal) else {**inputs, "normal": normal})
+    of_coat = (
+        ["normal"] if model == "UsdPreviewSurface" else ["coat_normal", "geometry_coat_normal", "clearcoat_normal"]
+    )
+    for key, names in (("normal", ["normal", "geometry_normal"]), ("coat_normal", of_coat)):
+        given_normal = next((given[known] for known in names if known in given), 0.0)
+        inputs |= {} if is_constant(given_normal) else {key: given_normal}
+    return MaterialContents(name, inputs)
 
 
 def standard_surface(i: Given) -> dict[str, Input]:
@@ -63,10 +69,10 @@ def standard_surface(i: Given) -> dict[str, Input]:
         _times(i("base"), _powered(i("base_color"), gamma)), _powered(i("subsurface_color"), gamma), i("subsurface")
     )
     metal = _times(i("base"), i("base_color"))
-    below = _times(_mixed(WHITE, i("coat_color"), coat), _below_coat(coat, i("coat_IOR")))
+    tint = _mixed(WHITE, i("coat_color"), coat)
     roughening = number("multiply", number("multiply", i("coat_affect_roughness"), coat), i("coat_roughness"))
     return {
-        "base_color": _times(_mixed(diffuse, metal, i("metalness")), below),
+        "base_color": _times(_mixed(diffuse, metal, i("metalness")), tint),
         "metalness": i("metalness"),
         "edge_color": _times(i("specular"), i("specular_color")),
         "specular": i("specular"),
@@ -84,7 +90,7 @@ def standard_surface(i: Given) -> dict[str, Input]:
         "coat_ior": i("coat_IOR"),
         "sheen": i("sheen"),
         "sheen_color": i("sheen_color"),
-        "emission": _times(_times(i("emission"), i("emission_color")), below),
+        "emission": _times(_times(_times(i("emission"), i("emission_color")), tint), _below_coat(coat, i("coat_IOR"))),
         "opacity": node("extract", "float", in_=node("luminance", "color3", in_=i("opacity")), index=0.0),
     }
 
@@ -101,7 +107,8 @@ def open_pbr_surface(i: Given) -> dict[str, Input]:
     kept = node("subtract", "color3", in1=WHITE, in2=_times(inner, base))
     darkening = node("divide", "color3", in1=_times(_complement(inner), WHITE), in2=kept)
     darkened = _mixed(WHITE, darkening, number("multiply", coat, i("coat_darkening")))
-    below = _times(_times(darkened, _mixed(WHITE, i("coat_color"), coat)), _below_coat(coat, i("coat_ior")))
+    below = _times(darkened, _mixed(WHITE, i("coat_color"), coat))
+    emission = _times(_times(i("emission_luminance"), i("emission_color")), below)
     of_coat = number("multiply", 2.0, number("power", i("coat_roughness"), 4.0))
     fourth = _plus(number("power", i("specular_roughness"), 4.0), of_coat)
     rough = _mixed(i("specular_roughness"), number("power", number("min", fourth, 1.0), 0.25), coat, "float")
@@ -127,7 +134,7 @@ def open_pbr_surface(i: Given) -> dict[str, Input]:
         "coat_ior": i("coat_ior"),
         "sheen": i("fuzz_weight"),
         "sheen_color": i("fuzz_color"),
-        "emission": _times(_times(i("emission_luminance"), i("emission_color")), below),
+        "emission": _times(emission, _below_coat(coat, i("coat_ior"))),
         "opacity": i("geometry_opacity"),
     }
 
@@ -135,8 +142,8 @@ def open_pbr_surface(i: Given) -> dict[str, Input]:
 def preview_surface(i: Given) -> dict[str, Input]:
     """UsdPreviewSurface.
 
-    By its specification, opacity below 1 is glass if ``opacityMode`` is transparent, its default. Images of opacity
-    are cut-outs of leaves and fences, unless the mode is authored.
+    By its specification and MaterialX's graph, opacity below 1 is clear glass if ``opacityMode`` is transparent, its
+    default, also below rough reflections. Images of opacity are presence, as for leaves, unless the mode is authored.
     """
     is_specular = i("useSpecularWorkflow") == 1
     opacity, threshold, mode = i("opacity"), i("opacityThreshold"), i("opacityMode")
@@ -146,15 +153,15 @@ def preview_surface(i: Given) -> dict[str, Input]:
         presence = node("ifgreatereq", "float", value1=opacity, value2=threshold, in1=1.0, in2=0.0)
     elif mode == "transparent" or (mode in ("", 0.0) and is_constant(opacity)):
         presence, transmission = 1.0, node("invert", "float", in_=opacity, amount=1.0)
-    base = _times(i("diffuseColor"), _below_coat(i("clearcoat"), i("ior")))
     return {
-        "base_color": base,
+        "base_color": i("diffuseColor"),
         "metalness": 0.0 if is_specular else i("metallic"),
-        "edge_color": edge_color(base, WHITE),
+        "edge_color": edge_color(i("diffuseColor"), WHITE),
         "specular_color": node("divide", "color3", in1=i("specularColor"), in2=0.04) if is_specular else WHITE,
         "ior": 1.5 if is_specular else i("ior"),
         "roughness": i("roughness"),
         "transmission": transmission,
+        "clear": 1.0,
         "coat": i("clearcoat"),
         "coat_roughness": i("clearcoatRoughness"),
         "coat_ior": i("ior"),
@@ -167,8 +174,6 @@ def gltf_pbr(i: Given) -> dict[str, Input]:
     """PBR of glTF 2.0 with its extensions."""
     mode = i("alpha_mode")
     cut = node("ifgreatereq", "float", value1=i("alpha"), value2=i("alpha_cutoff"), in1=1.0, in2=0.0)
-    coat = i("clearcoat")
-    below = _below_coat(coat, 1.5)
     # Widths are r^2 and that mixed with 1 by the square of the strength.
     narrow = number("multiply", i("roughness"), i("roughness"))
     wide = _mixed(narrow, 1.0, number("multiply", i("anisotropy_strength"), i("anisotropy_strength")), "float")
@@ -177,11 +182,10 @@ def gltf_pbr(i: Given) -> dict[str, Input]:
     anisotropy = _complement(number("divide", narrow, number("max", wide, 1e-6)))
     colors = [node("extract", "float", in_=i("sheen_color"), index=float(k)) for k in range(3)]
     sheen = number("max", number("max", colors[0], colors[1]), colors[2])
-    base = _times(i("base_color"), below)
     return {
-        "base_color": base,
+        "base_color": i("base_color"),
         "metalness": i("metallic"),
-        "edge_color": edge_color(base, WHITE),
+        "edge_color": edge_color(i("base_color"), WHITE),
         "specular": i("specular"),
         "specular_color": i("specular_color"),
         "ior": i("ior"),
@@ -192,7 +196,7 @@ def gltf_pbr(i: Given) -> dict[str, Input]:
         "transmission_color": i("base_color"),
         **({} if is_thin else {"depth_color": i("attenuation_color"), "depth": i("attenuation_distance")}),
         "thin": float(is_thin),
-        "coat": coat,
+        "coat": i("clearcoat"),
         "coat_roughness": i("clearcoat_roughness"),
         "sheen": sheen,
         "sheen_color": WHITE if sheen == 0 else node("divide", "color3", in1=i("sheen_color"), in2=sheen),
@@ -236,7 +240,7 @@ def conductor(reflectivity: ArrayLike, edge: ArrayLike) -> tuple[NDArray[np.floa
     return n, k
 
 
-def conductor_reflectance(n: ArrayLike, k: ArrayLike, cosine: float) -> NDArray[np.float64]:
+def conductor_reflectance(n: ArrayLike, k: ArrayLike, cosine: float | NDArray) -> NDArray[np.float64]:
     """Unpolarized reflectance of a metal (Fresnel)."""
     eta, kappa = np.asarray(n, dtype=np.float64), np.asarray(k, dtype=np.float64)
     sine = 1 - cosine**2

@@ -165,12 +165,16 @@ def test_thin_glass_has_its_colour_after_one_sheet(model, given):
     np.testing.assert_allclose(transmitted, (1 - expected) * np.array(COLOR), rtol=5e-3)
 
 
-def test_opacity_of_preview_surfaces_is_glass_unless_it_is_presence():
+def test_opacity_of_preview_surfaces_is_clear_glass_unless_it_is_presence():
+    """By the specification, roughness is that of reflections only."""
     glass, _ = entry(look("UsdPreviewSurface", opacity=0.0, roughness=0.0))
     assert (glass["type"], glass["int_ior"]) == ("dielectric", 1.5)
     half, _ = entry(look("UsdPreviewSurface", opacity=0.25, roughness=0.5, diffuseColor=COLOR))
     assert (half["type"], half["weight"]) == ("blendbsdf", 0.75)
-    assert (half["bsdf_1"]["type"], half["bsdf_1"]["alpha"]) == ("roughdielectric", pytest.approx(0.25))
+    assert (half["bsdf_1"]["type"], half["bsdf_0"]["bsdf"]["roughness"]) == ("dielectric", 0.5)
+    image = TextureContents("none.png", "r", "raw", fallback=[0.25] * 4)
+    for mode, kind in (("", "mask"), ("presence", "mask"), ("transparent", "blendbsdf")):
+        assert entry(look("UsdPreviewSurface", opacity=image, opacityMode=mode))[0]["type"] == kind
     hole, _ = entry(look("UsdPreviewSurface", opacity=0.25, opacityMode="presence"))
     assert (hole["type"], hole["opacity"]) == ("mask", 0.25)
     for opacity, expected in ((0.4, 0.0), (0.6, 1.0)):
@@ -212,10 +216,10 @@ def test_models_agree_where_they_mean_the_same():
         assert [*lobe["base_color"]["value"], lobe["roughness"], lobe["eta"]] == pytest.approx([*COLOR, 0.4, 1.6])
     # Reflections are the same from the inside. By the specification, the coat has the same index.
     given = {"metallic": 0.4, "ior": 0.5, "clearcoat": 0.7, "clearcoatRoughness": 0.2}
-    lobe = bsdf_of("UsdPreviewSurface", **given, diffuseColor=COLOR)
-    expected = {"metallic": 0.4, "eta": 2.0, "clearcoat": 0.7 / 9 / 0.04, "clearcoat_gloss": 0.06 / 0.099}
-    assert {name: lobe[name] for name in expected} == pytest.approx(expected, rel=1e-5)
-    np.testing.assert_allclose(lobe["base_color"]["value"], np.array(COLOR) * (1 - 0.7 / 9), rtol=1e-6)
+    coated = entry(look("UsdPreviewSurface", **given, diffuseColor=COLOR))[0]
+    base, coat = coated["bsdf_0"]["bsdf"], coated["bsdf_1"]["bsdf"]
+    assert [base["metallic"], base["eta"], coat["eta"], coat["alpha"]] == pytest.approx([0.4, 2.0, 2.0, 0.04])
+    assert base["base_color"]["value"] == pytest.approx(COLOR)
 
 
 ROUGH_METAL = {"metalness": 1.0, "specular_roughness": 0.5, "specular_anisotropy": 0.75}
@@ -248,9 +252,8 @@ TURNED = {"metalness": 1.0, "specular_anisotropy": 0.5, "specular_rotation": 0.1
 # Of materials, what is told, or nothing.
 TOLD = [
     ("open_pbr_surface", {**COATED, "specular_color": [1.0, 1.0, 1.0]}, None),
-    ("open_pbr_surface", {**COATED, "specular_color": [0.6, 0.6, 0.6]}, "edge colours"),
+    ("open_pbr_surface", {**COATED, "specular_color": [0.6] * 3, "fuzz_weight": 1.0}, "edge colours"),
     ("standard_surface", TURNED, "rounded to quarter turns"),
-    ("standard_surface", {"coat": 1.0, "coat_roughness": 0.6}, "coats rougher than 0.32"),
 ]
 
 
@@ -269,16 +272,30 @@ def test_the_strength_of_reflections_is_an_index_of_refraction():
     assert strong["metallic"] == 0
 
 
-def test_coats_dim_what_lies_below():
-    """By what they reflect, by their colour, and in OpenPBR by what they reflect back."""
+def test_coats_dim_the_base():
+    """By their colour, in OpenPBR by what they reflect back, and by their mean reflectance."""
     dimmed = look("standard_surface", base_color=[0.5] * 3, coat=1.0, coat_color=[1.0, 0.5, 0.2]).inputs["base_color"]
-    np.testing.assert_allclose(dimmed, 0.5 * 0.96 * np.array([1, 0.5, 0.2]))
+    np.testing.assert_allclose(dimmed, 0.5 * np.array([1, 0.5, 0.2]))
     dimmed = look("open_pbr_surface", base_color=[0.5] * 3, coat_weight=1.0, coat_ior=1.5).inputs["base_color"]
     inner = 1 - 0.96 / 1.5**2
-    np.testing.assert_allclose(dimmed, 0.5 * 0.96 * (1 - inner) / (1 - 0.5 * inner))
-    coated = bsdf_of("standard_surface", coat=1.0, coat_IOR=1.6, coat_roughness=0.2)
-    expected = [(0.6 / 2.6) ** 2 / 0.04, 0.06 / 0.099]
-    assert [coated["clearcoat"], coated["clearcoat_gloss"]] == pytest.approx(expected)
+    np.testing.assert_allclose(dimmed, 0.5 * (1 - inner) / (1 - 0.5 * inner))
+    mean = float(mi.fresnel_diffuse_reflectance(mi.Float(1.6))[0])
+    reflected, _ = both("standard_surface", 0, base_color=COLOR, specular=0.0, coat=0.5, coat_IOR=1.6)
+    np.testing.assert_allclose(reflected, (1 - 0.5 * mean) * np.array(COLOR) + 0.5 * (0.6 / 2.6) ** 2, rtol=SAMPLED)
+    bumps = TextureContents("bumps.png", "rgb", "raw")
+    normals = {"standard_surface": {"normal"}, "UsdPreviewSurface": {"normal", "coat_normal"}}
+    for model, expected in normals.items():
+        given = {"normal": bumps, "opacityMode": ""}
+        assert {k for k, v in surface_models.material("/paint", model, given).inputs.items() if v is bumps} == expected
+
+
+@pytest.mark.parametrize("degrees", [0, 45, 60, 80])
+def test_coats_reflect_as_dielectrics_at_every_angle(degrees):
+    """The coat of `principled` reflects a sixth of that at 60 degrees."""
+    black = {"base": 0.0, "specular": 0.0, "coat_IOR": 1.6}
+    reflected, _ = both("standard_surface", degrees, coat=0.5, coat_roughness=0.0, **black)
+    expected = 0.5 * conductor_reflectance(1.6, 0, math.cos(math.radians(degrees)))
+    np.testing.assert_allclose(reflected, expected, rtol=SAMPLED)
 
 
 def test_bodies_absorb_nothing_without_a_distance_and_all_of_a_colour_that_they_have_none_of():
