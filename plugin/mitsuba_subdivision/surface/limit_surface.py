@@ -28,7 +28,7 @@ from ..patches.polynomial_pieces import ElementBounds, SurfacePieces
 from ..refinement.adapted_scheme import adapted_scheme
 from ..schemes import Scheme
 from ..schemes.domain import FloatArray
-from ..tessellation.attribute_table import AttributeTable
+from ..tessellation.attribute_table import AttributeTable, attribute_table
 from ..tessellation.uniform import uniform_table
 from ..tessellation.vertex_table import Tessellation, VertexMatrices, VertexTable
 from ..variants import variant_name
@@ -570,7 +570,7 @@ class LimitSurface:
             If the scheme has no rules for one of them.
         """
         channels = {name: self.channel(name) for name in (self.attribute_names if names is None else names)}
-        return AttributeTable.build(table, self.patches, channels)
+        return attribute_table(table, self.patches, channels)
 
     def sample_vertices(
         self, table: VertexTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float

@@ -93,13 +93,12 @@ class AttributeTable:
     # equal values share them
     values: Mapping[str, FloatArray]
 
-    @classmethod
-    def build(cls, table: VertexTable, patches: PatchTable, channels: Mapping[str, Channel]) -> AttributeTable:
-        """Evaluate attributes in float64."""
-        layouts = tuple(channel.layout for channel in channels.values())
-        layout, values = shared(AttributeLayout, table, patches, layouts), {}
-        for name, channel in channels.items():
-            key = AttributeTable, layout, channel.layout, Content(channel.values)
-            values[name] = shared_by_key(key, partial(layout.evaluated, channel))
-            values[name].flags.writeable = False
-        return cls(layout, values)
+
+def attribute_table(table: VertexTable, patches: PatchTable, channels: Mapping[str, Channel]) -> AttributeTable:
+    """Evaluate attributes at the vertices of a tessellation, in float64."""
+    layout, values = shared(AttributeLayout, table, patches, tuple(c.layout for c in channels.values())), {}
+    for name, channel in channels.items():
+        key = AttributeTable, layout, channel.layout, Content(channel.values)
+        values[name] = shared_by_key(key, partial(layout.evaluated, channel))
+        values[name].flags.writeable = False
+    return AttributeTable(layout, values)
