@@ -32,7 +32,7 @@ from .parameter_table import PARAMETER_OF_NAME, errors_about, value_of
 from .placement import checked_matrix
 
 if TYPE_CHECKING:
-    from ..tessellation.criterion import DisplacementBound, Sensor
+    from ..tessellation.criterion import HeightsAt, Sensor
     from ..tessellation.vertex_table import VertexTable
 
 TEXCOORD_INDICES = "texcoord_indices"
@@ -68,15 +68,16 @@ class Tessellation:
         surface: LimitSurface,
         control_points: NDArray,  # (n, 3) float64 in object space
         to_world: NDArray,  # (4, 4) float64
-        bound: DisplacementBound | None,  # In world space
+        displacement: tuple[HeightsAt, float] | None,  # Heights in world space, and the highest, as of `Criterion`
     ) -> VertexTable:
         """Prepare the tessellation. A uniform one does not depend on the control points."""
         if self.limit is None:
             return surface.sampling(self.rate)
         criterion = self.criterion
-        if bound is not None:
+        if displacement is not None:
+            heights, highest = displacement
             # The limit holds everywhere, as silhouettes are unknown.
-            criterion = replace(criterion, outline=None, displacement=bound)
+            criterion = replace(criterion, outline=None, heights=heights, highest=highest)
         world_points = control_points @ to_world[:3, :3].T + to_world[:3, 3]
         with errors_about(self.limit):
             return surface.adaptive_sampling(criterion, self.rate, world_points)
@@ -234,13 +235,13 @@ def _tessellation(props: mi.Properties) -> Tessellation:
             f"an adaptive tessellation has {' and '.join(limits) or 'no limit'}; expected exactly one of "
             f"{', '.join(LIMITS)}"
         )
-    from ..tessellation.criterion import Criterion, Measure
+    from ..tessellation.criterion import Criterion
 
     (limit,) = limits
     is_of_pixels, fits_outline = limit == "pixel_error", value_of(props, "outline") == "sensor"
     sensor = _sensor(props, "outline" if fits_outline else "pixel_error" if is_of_pixels else None)
     criterion = Criterion(
-        Measure.EDGE if limit == "max_edge" else Measure.CHORD,
+        "edge" if limit == "max_edge" else "chord",
         float(value_of(props, limit)),
         sensor if is_of_pixels else None,
         sensor if fits_outline else None,
