@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage import cage_of
 from mitsuba_subdivision.tessellation.criterion import Criterion, Sensor
 from processes import ROOT, measured, peak_memory, print_row, run
 
@@ -121,7 +122,7 @@ def _cages(path):
         shapes = [*contents.shapes, *(shape for group in contents.groups for shape in group)]
         for shape in shapes:
             if shape.cage.scheme is not None:
-                yield ControlCage.from_arrays(**shape.cage.as_arguments())
+                yield cage_of(shape.cage)
 
 
 if __name__ == "__main__":
