@@ -24,7 +24,7 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels.locations import TriangleLocations
 from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
-from mitsuba_subdivision.tessellation.criterion import Criterion, Measure, Sensor
+from mitsuba_subdivision.tessellation.criterion import Criterion, Sensor
 from mitsuba_subdivision.tessellation.vertex_table import VertexTable
 from scipy.spatial import cKDTree
 
@@ -57,7 +57,7 @@ def main() -> None:
         surface = LimitSurface(ControlCage.from_file(CAGES / f"{cage}.obj"), scheme)
         uniform = surface.sampling(options.rate)
         error = chord_error(surface, uniform)
-        adaptive = surface.adaptive_sampling(Criterion(Measure.CHORD, error))
+        adaptive = surface.adaptive_sampling(Criterion("chord", error))
         report(f"{name}, chord", uniform, error, adaptive, chord_error(surface, adaptive))
         if name in WITH_OUTLINES:
             outlines, asked = Outlines(surface), COARSEST
@@ -104,7 +104,7 @@ class Outlines:
 
     def adaptive(self, pixel_error: float) -> VertexTable:
         sensor = Sensor(self.eye, self.pixel / np.hypot(1, self.pixel * WIDTH / np.sqrt(2)))
-        return self.surface.adaptive_sampling(Criterion(Measure.CHORD, pixel_error, sensor, sensor))
+        return self.surface.adaptive_sampling(Criterion("chord", pixel_error, sensor, sensor))
 
     def error(self, table: VertexTable) -> float:
         """Hausdorff distance from the reference, in pixels."""

@@ -18,7 +18,7 @@ from mitsuba_subdivision.cage import (
     CageContents,
     CageError,
     CageWarning,
-    ControlCage,
+    cage_of,
     noting_warnings,
     same,
     same_topology,
@@ -152,7 +152,7 @@ class Surfaces:
             if same(known, contents):
                 return surface
         with noting_warnings() as messages, without_warnings():
-            surface = LimitSurface(ControlCage.from_arrays(**contents.as_arguments()))
+            surface = LimitSurface(cage_of(contents))
         alike.append((contents, surface))
         self.messages[surface] = messages
         return surface
@@ -226,7 +226,7 @@ def _light_area(shape: ShapeContents) -> float:
         return 1.0
     cage = replace(shape.cage, positions=points_at(np.asarray(shape.cage.positions, np.float64), shape.to_world))
     if cage.scheme is not None:
-        return LimitSurface(ControlCage.from_arrays(**cage.as_arguments())).area()
+        return LimitSurface(cage_of(cage)).area()
     corners, face = triangle_corners(cage.positions, cage.face_sizes, cage.face_vertices)
     p = cage.positions[cage.face_vertices[corners[~np.isin(face, cage.holes)]]]
     return float(np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1).sum() / 2) or 1.0

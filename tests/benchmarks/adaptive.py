@@ -20,7 +20,8 @@ from pathlib import Path
 
 import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
-from mitsuba_subdivision.tessellation.criterion import Criterion, Measure, Sensor
+from mitsuba_subdivision.cage import cage_of
+from mitsuba_subdivision.tessellation.criterion import Criterion, Sensor
 from processes import ROOT, measured, peak_memory, print_row, run
 
 OUTLINES = "outlines"
@@ -87,11 +88,11 @@ def tessellations(_clock, model, scheme, error, rate):
 def _criterion(cage, error):
     size = np.linalg.norm(np.ptp(cage.positions, axis=0))
     if error != OUTLINES:
-        return Criterion(Measure.CHORD, error * size)
+        return Criterion("chord", error * size)
     distance, pixels = 2.0, 640
     eye = cage.positions.mean(axis=0) + distance * size * np.array([0.6, 0.48, 0.64])
     sensor = Sensor(eye, 1 / (distance * pixels))
-    return Criterion(Measure.CHORD, 0.1, sensor, sensor)
+    return Criterion("chord", 0.1, sensor, sensor)
 
 
 def farthest(_clock, model, scheme, error):
@@ -121,7 +122,7 @@ def _cages(path):
         shapes = [*contents.shapes, *(shape for group in contents.groups for shape in group)]
         for shape in shapes:
             if shape.cage.scheme is not None:
-                yield ControlCage.from_arrays(**shape.cage.as_arguments())
+                yield cage_of(shape.cage)
 
 
 if __name__ == "__main__":

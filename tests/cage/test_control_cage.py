@@ -6,7 +6,7 @@ from itertools import islice
 import mitsuba
 import numpy as np
 import pytest
-from mitsuba_subdivision.cage import Attribute, CageError, ControlCage
+from mitsuba_subdivision.cage import Attribute, CageError, ControlCage, cage_of
 from mitsuba_subdivision.cage.contents import RULES, CageContents, same
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from patches.closed_cages import mixed_torus, polygons, torus
@@ -159,14 +159,14 @@ def test_a_cage_of_its_own_contents_is_the_same(np_rng):
     tags = {"creases": [(0, 1, 0.3), (0, 2, 12)], "corners": [(3, 1 / 3)], "holes": [4, 2]}
     rules = {rule: values[-1] for rule, values in RULES.items()}
     cage = tagged(base, **tags, **values, **rules, scheme="loop")
-    again = ControlCage.from_arrays(**cage.contents.as_arguments())
+    again = cage_of(cage.contents)
     assert same(again.contents, cage.contents)
     assert same(again.tags, cage.tags)
     assert again.source == cage.source
     assert {rule: getattr(again, rule) for rule in RULES} == rules
     box = cube()
     plain = CageContents(box.positions, box.face_sizes, box.face_vertices)
-    cage = ControlCage.from_arrays(**plain.as_arguments())
+    cage = cage_of(plain)
     assert {rule: getattr(cage, rule) for rule in RULES} == {rule: values[0] for rule, values in RULES.items()}
     assert (cage.scheme, cage.texcoords, cage.attributes, len(cage.holes)) == (None, None, {}, 0)
     assert not cage.tags.any

@@ -6,7 +6,7 @@ from gradients.surfaces import ALL
 from kernels.surfaces import derivatives_both_ways
 from mitsuba_subdivision.kernels.vertex_kernel import VertexKernel, placed
 from mitsuba_subdivision.llvm import llvm_problem
-from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
+from mitsuba_subdivision.tessellation.criterion import Criterion
 
 pytestmark = pytest.mark.skipif(llvm_problem() is not None, reason="no usable LLVM")
 
@@ -24,7 +24,7 @@ def table_of(surface, tessellation):
     if tessellation == "uniform":
         return surface.sampling(3)
     chord = CHORD * np.ptp(surface.cage.positions, axis=0).max()
-    return surface.adaptive_sampling(Criterion(Measure.CHORD, chord), 16)
+    return surface.adaptive_sampling(Criterion("chord", chord), 16)
 
 
 def on_host(table, positions, matrix):

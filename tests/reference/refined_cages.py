@@ -5,6 +5,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision.cage import cage_of
 from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.mesh import shared
 from mitsuba_subdivision.mesh.cuts import CutMesh
@@ -36,7 +37,7 @@ def tagged(cage, **options):
 def changed(cage, **options):
     """A cage with other options, or arrays, of `ControlCage.from_arrays`, and the others of its own."""
     with without_warnings():
-        return ControlCage.from_arrays(**{**cage.contents.as_arguments(), **options})
+        return cage_of(cage.contents, **options)
 
 
 def upper_half(ball):

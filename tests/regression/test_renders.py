@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import variants
 from mitsuba_subdivision.__main__ import main
-from mitsuba_subdivision.commands import render
+from mitsuba_subdivision.commands import pictures
 from mitsuba_subdivision.commands.cluster import render_on_cluster
 from mitsuba_subdivision.regression import RegressionError
 from mitsuba_subdivision.regression import scene as scenes
@@ -293,7 +293,7 @@ def test_a_cluster_gives_the_bits_of_one_machine_although_a_worker_dies(tmp_path
     # Of LLVM variants, the bits are promised.
     reference = ["render", str(SCENE), "-D", "resolution=16", "--reference", "--batch", "1", "--passes", "4"]
     reference += ["--spp", "4", "--variant", "llvm_ad_rgb"]
-    monkeypatch.setattr(render, "_frame", partial(frame_after_a_death, render._frame, tmp_path / "died"))
+    monkeypatch.setattr(pictures, "_frame", partial(frame_after_a_death, pictures._frame, tmp_path / "died"))
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster:
         for name, where in (("together", ["--dask", cluster.scheduler_address]), ("alone", [])):
             capsys.readouterr()

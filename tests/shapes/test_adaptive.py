@@ -4,7 +4,7 @@ import pytest
 from mitsuba_subdivision import LimitSurface, pixel_error_for, upload
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.shapes.parameters import sensor_in_world
-from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
+from mitsuba_subdivision.tessellation.criterion import Criterion
 from patches.closed_cages import bumpy
 from shapes.cages import cube, load
 from shapes.scenes import SINGLE, buffer, film, perspective, vertices
@@ -12,7 +12,7 @@ from shapes.updates import update
 from shapes.variants import every_variant, llvm, scalar
 
 ADAPTIVE = {"tessellation": "adaptive", "max_rate": 32}
-CHORD = Criterion(Measure.CHORD, 1e-2)
+CHORD = Criterion("chord", 1e-2)
 # Of a pixel; closest points are found in double precision, vertices are stored in single precision.
 PIXEL = 1e-3
 CAGE = bumpy(named_cages.extraordinary(5))

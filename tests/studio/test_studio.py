@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mitsuba_subdivision.cage import CageError, named_cages
+from mitsuba_subdivision.cage import CageError, cage_of, named_cages
 from mitsuba_subdivision.cage.errors import CageWarning
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.regression.scene import load_scene
@@ -155,7 +155,7 @@ def test_a_scene_of_arrays_is_saved_with_its_cages(tmp_path):
 
 
 def _with(**more):
-    return msub.ControlCage.from_arrays(**{**named_cages.cube().contents.as_arguments(), **more})
+    return cage_of(named_cages.cube().contents, **more)
 
 
 VALUES, CORNERS = np.linspace(0.25, 1, 16).reshape(8, 2), np.linspace(0.25, 1, 72).reshape(24, 3)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from kernels.surfaces import SURFACES, random_locations, surface_named
 from mitsuba_subdivision import Attribute, LimitSurface
-from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
+from mitsuba_subdivision.tessellation.criterion import Criterion
 from patches.closed_cages import mixed_torus
 from reference.refined_cages import refine_first, tagged
 
@@ -98,7 +98,7 @@ def test_vertices_are_samples_where_they_say(name, monkeypatch):
     # Odd and even, and halves of these odd and even.
     assert_vertices_are_samples(surface, surface.sampling(1 + list(SURFACES).index(name) % 6))
     chord = 0.03 * np.ptp(surface.cage.positions, axis=0).max()
-    assert_vertices_are_samples(surface, surface.adaptive_sampling(Criterion(Measure.CHORD, chord)))
+    assert_vertices_are_samples(surface, surface.adaptive_sampling(Criterion("chord", chord)))
     refine_first(monkeypatch)
     refined = LimitSurface(surface.cage, surface.scheme)
     if refined.patches.refined is not None:

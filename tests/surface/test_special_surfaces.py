@@ -3,7 +3,7 @@ import pytest
 from kernels.surfaces import random_locations, surface_named
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
-from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
+from mitsuba_subdivision.tessellation.criterion import Criterion
 from patches.closed_cages import bumpy, mixed_torus
 from reference.refined_cages import refine_first, tagged
 
@@ -83,7 +83,7 @@ BLOCKS = {
 def test_blocks_that_bound_memory_do_not_show(name, np_rng, monkeypatch):
     named = surface_named(name)
     where, points = random_locations(named, np_rng, 200), np_rng.uniform(-1.5, 3, (50, 3))
-    criterion = Criterion(Measure.CHORD, 1e-2 * np.linalg.norm(np.ptp(named.cage.positions, axis=0)))
+    criterion = Criterion("chord", 1e-2 * np.linalg.norm(np.ptp(named.cage.positions, axis=0)))
 
     def results():
         # Tables of its own: a surface keeps what it has made.

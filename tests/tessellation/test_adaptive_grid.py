@@ -10,7 +10,7 @@ from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.tessellation import adaptive
 from mitsuba_subdivision.tessellation.adaptive import feature_edges
 from mitsuba_subdivision.tessellation.adaptive_grid import PatchFrames
-from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
+from mitsuba_subdivision.tessellation.criterion import Criterion
 from patches.closed_cages import bumpy
 from tessellation.distances import distances_of_pairs
 from tessellation.test_attribute_table import EVERY_CAGE, with_seams
@@ -23,7 +23,7 @@ def size_of(surface):
     return np.linalg.norm(np.ptp(surface.cage.positions, axis=0))
 
 
-def table_of(surface, error=1e-3, max_rate=16, measure=Measure.CHORD, **options):
+def table_of(surface, error=1e-3, max_rate=16, measure="chord", **options):
     # Grids are tested at any rates, also at those that are too low.
     with without_warnings():
         return surface.adaptive_sampling(Criterion(measure, error * size_of(surface), **options), max_rate)
@@ -109,14 +109,13 @@ def assert_vertices_lie_where_triangles_say(surface, table):
 def test_attributes_are_exact_on_both_sides_of_seams(scheme, cage, np_rng):
     surface = LimitSurface(with_seams(bumpy(cage), np_rng), scheme)
     table = table_of(surface, 5e-3)
-    attributes = surface.attribute_table(table)
-    layout = attributes.layout
+    layout, attributes = surface.attribute_table(table)
     assert layout.surface_vertex is not None
     np.testing.assert_array_equal(layout.surface_vertex[layout.triangles], table.triangles)
     corner, uv = table.grid.triangle_locations
     element = table.element.repeat(3)
     places = element, uv.reshape(-1, 2), corner.repeat(3) - surface.patches.elements.face_offsets[element]
-    for name, values in attributes.values.items():
+    for name, values in attributes.items():
         expected = surface.evaluate_attribute(name, *places)
         np.testing.assert_allclose(values[layout.triangles.ravel()], expected, rtol=0, atol=ROUNDING)
 
@@ -188,7 +187,7 @@ FOLDED = {
 def test_edges_are_features_where_faces_lie_back_to_back(cage, is_folded):
     surface = LimitSurface(cage)
     vertex = surface.cage.cut_mesh.vertex
-    frames, criterion = PatchFrames.of(surface.patches), Criterion(Measure.CHORD, 1e-3)
+    frames, criterion = PatchFrames.of(surface.patches), Criterion("chord", 1e-3)
     assert (feature_edges(surface.patches, frames, cage.positions[vertex], criterion) == is_folded).all()
 
 
@@ -229,5 +228,5 @@ def test_too_many_triangles_are_refused_before_most_tiles_are_looked_at(monkeypa
 
     monkeypatch.setattr(adaptive.TileRates, "decided", counted)
     with pytest.raises(MemoryError, match="expected a larger error"):
-        surface.adaptive_sampling(Criterion(Measure.EDGE, 1e-9), 1024)
+        surface.adaptive_sampling(Criterion("edge", 1e-9), 1024)
     assert sum(seen) < 10 * surface.patches.patch_count

@@ -101,13 +101,12 @@ def test_attributes_without_seams_use_the_vertices_of_the_surface(scheme, np_rng
     colour = np_rng.random((cage.vertex_count, 3))
     surface = LimitSurface(tagged(cage, attributes={"colour": Attribute(colour)}), scheme)
     table = surface.sampling(3)
-    attributes = surface.attribute_table(table)
-    layout = attributes.layout
+    layout, attributes = surface.attribute_table(table)
     assert layout.surface_vertex is None
     assert layout.triangles is table.triangles
     assert layout.gathered(colour) is colour
     # The same weights as for points, so that these come out as points do.
-    np.testing.assert_allclose(attributes.values["colour"], table.apply(colour)[0], rtol=0, atol=ROUNDING)
+    np.testing.assert_allclose(attributes["colour"], table.apply(colour)[0], rtol=0, atol=ROUNDING)
 
 
 def test_other_evaluators_keep_the_values(np_rng):

@@ -13,8 +13,6 @@ from mitsuba_subdivision.tessellation.criterion import (
     BESIDE_OUTLINE,
     Cone,
     Criterion,
-    DisplacementBound,
-    Measure,
     Sensor,
     least_product,
 )
@@ -54,7 +52,7 @@ def test_neither_triangles_nor_the_surface_are_further_from_each_other_than_aske
 @pytest.mark.parametrize("name", CHECKED)
 def test_no_edge_is_longer_than_asked(name):
     surface = surface_named(name)
-    table = table_of(surface, 0.05, 256, Measure.EDGE)
+    table = table_of(surface, 0.05, 256, "edge")
     start, end = table.apply(surface.cage.positions)[0][directed_edges(table.triangles)].swapaxes(0, 1)
     assert np.linalg.norm(end - start, axis=1).max() <= 0.05 * size_of(surface)
 
@@ -75,16 +73,16 @@ def test_rates_stay_below_the_highest(name):
 @pytest.mark.parametrize(
     ("name", "measure"),
     [
-        ("cube", Measure.EDGE),
-        ("loop mixed torus", Measure.CHORD),
-        ("doo_sabin mixed torus", Measure.EDGE),
-        ("half disc of 6", Measure.CHORD),
+        ("cube", "edge"),
+        ("loop mixed torus", "chord"),
+        ("doo_sabin mixed torus", "edge"),
+        ("half disc of 6", "chord"),
     ],
 )
 def test_a_warning_names_the_highest_rate_that_the_limit_needs(name, measure):
     """Or one nearer to it: how many segments patches need that are not divided is not known."""
     surface, rates = surface_named(name), [2]
-    criterion = Criterion(measure, {Measure.CHORD: 1e-3, Measure.EDGE: 0.05}[measure] * size_of(surface))
+    criterion = Criterion(measure, {"chord": 1e-3, "edge": 0.05}[measure] * size_of(surface))
     while True:
         with warnings.catch_warnings(record=True, action="always") as caught:
             table = surface.adaptive_sampling(criterion, rates[-1])
@@ -148,7 +146,7 @@ def test_an_isolated_point_of_high_rate_stays_isolated():
     flat = sheet(12, 12)
     pulled = (flat.positions[:, :2] == 6).all(axis=1)
     surface = LimitSurface(flat.with_positions(flat.positions + np.outer(pulled, [0, 0, 3])))
-    table = surface.adaptive_sampling(Criterion(Measure.CHORD, 1e-3), 64)
+    table = surface.adaptive_sampling(Criterion("chord", 1e-3), 64)
     counts = np.bincount(table.element, minlength=144).reshape(12, 12)
     assert counts[4:8, 4:8].min() > 20
     # Faces beside these have more vertices on one side, all others are two triangles.
@@ -159,7 +157,7 @@ def test_an_isolated_point_of_high_rate_stays_isolated():
 def test_an_even_torus_has_no_more_triangles_than_the_uniform_grid():
     uniform = TORUS.sampling(16)
     largest = distance(TORUS, uniform)
-    table = TORUS.adaptive_sampling(Criterion(Measure.CHORD, largest), 64)
+    table = TORUS.adaptive_sampling(Criterion("chord", largest), 64)
     assert len(table.triangles) <= 1.05 * len(uniform.triangles)
     assert distance(TORUS, table) <= largest
 
@@ -173,7 +171,7 @@ def test_rings_follow_a_close_look_at_an_extraordinary_vertex(valence):
     point = surface.evaluate([element], [[0.0, 0.0]], corner)
     for away in (1e-1, 1e-4):
         eye = point.p[0] + away * point.n[0]
-        table = surface.adaptive_sampling(Criterion(Measure.EDGE, 100.0, Sensor(eye, 1e-3)), 128)
+        table = surface.adaptive_sampling(Criterion("edge", 100.0, Sensor(eye, 1e-3)), 128)
         positions, _ = table.apply(surface.cage.positions)
         near = np.linalg.norm(positions - point.p[0], axis=1) < away
         corners = positions[table.triangles[near[table.triangles].all(axis=1)]]
@@ -198,7 +196,7 @@ def test_a_tangent_that_nearly_vanishes_leaves_the_whole_difference_as_the_bound
     points = np.stack([u, 0 * u, u**3], axis=1)[..., None].astype(np.float32)
     derivatives = [derivative.astype(np.float32) for derivative in derivatives_of(points)]
     derivatives[1][:] = np.float32(scale) * np.array([0, 0, 1])[:, None]
-    form = Criterion(Measure.CHORD, 1.0).form(points, derivatives, 4)
+    form = Criterion("chord", 1.0).form(points, derivatives, 4)
     whole = np.sqrt(np.square(derivatives[2]).sum(axis=1).max(axis=0))
     assert (form[0] <= np.float32(1 + 1e-6) * whole / 8).all()
     assert (form[0] > 0).all()
@@ -241,8 +239,8 @@ def test_pixels_are_as_small_as_at_the_nearest_point_of_a_box(np_rng):
 def test_only_outlines_are_fine_where_only_they_are_asked_for():
     # As fine as the highest rate allows, without a warning: pictures by default settings ask for outlines of a tenth of
     # a pixel, and for few triangles first.
-    TORUS.adaptive_sampling(Criterion(Measure.CHORD, 1e-3, SENSOR, SENSOR), 2)
-    criteria = (Criterion(Measure.CHORD, 0.1, SENSOR, outline) for outline in (None, SENSOR))
+    TORUS.adaptive_sampling(Criterion("chord", 1e-3, SENSOR, SENSOR), 2)
+    criteria = (Criterion("chord", 0.1, SENSOR, outline) for outline in (None, SENSOR))
     fine, at_outline = (TORUS.adaptive_sampling(criterion, 64) for criterion in criteria)
     assert len(at_outline.triangles) < len(fine.triangles) / 2
     points, normals = fine.apply(TORUS.cage.positions)
@@ -266,8 +264,7 @@ def test_rates_follow_a_displacement(name):
         height = 0.01 * size * np.sin(20 * x) * np.cos(15 * z)
         return samples.p + height[:, None] * samples.n, samples.n, height
 
-    bound = DisplacementBound(lambda start, uv: displaced(start, uv)[2], 0.01 * size)
-    table = table_of(surface, error, 64, displacement=bound)
+    table = table_of(surface, error, 64, heights=lambda start, uv: displaced(start, uv)[2], highest=0.01 * size)
     assert len(table.triangles) > 1.2 * len(table_of(surface, error, 64).triangles)
     corner, uv = table.grid.triangle_locations
     corners = np.stack([displaced(corner, uv[:, i])[0] for i in range(3)], axis=1)
@@ -286,8 +283,8 @@ def corners_on_sheet(scheme, heights, **criterion):
     def places(start, uv):
         return surface._sampler.evaluate(start.astype(np.int64), uv).p[:, :2]
 
-    bound = DisplacementBound(lambda start, uv: heights(places(start, uv)), 16.0)
-    start, uv = surface.adaptive_sampling(Criterion(**criterion, displacement=bound), 64).grid.triangle_locations
+    criterion |= {"heights": lambda start, uv: heights(places(start, uv)), "highest": 16.0}
+    start, uv = surface.adaptive_sampling(Criterion(**criterion), 64).grid.triangle_locations
     xy = np.stack([places(start, uv[:, i]) for i in range(3)], axis=1)
     return np.concatenate([xy, heights(xy)[..., None]], axis=2)
 
@@ -300,7 +297,7 @@ def test_a_flat_sheet_is_divided_where_its_heights_bend(bend, scheme):
     def heights(xy):
         return np.stack([xy[..., 0] ** 2 / 2, xy[..., 0] * xy[..., 1], xy[..., 1] ** 2 / 2], axis=-1) @ bend
 
-    corners = corners_on_sheet(scheme, heights, measure=Measure.CHORD, error=0.02)
+    corners = corners_on_sheet(scheme, heights, measure="chord", error=0.02)
     points = WEIGHTS @ corners
     away = np.abs(heights(points[..., :2]) - points[..., 2]).max()
     assert 0.002 < away <= 0.02
@@ -310,16 +307,16 @@ def test_a_flat_sheet_is_divided_where_its_heights_bend(bend, scheme):
 @pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
 @pytest.mark.parametrize("slope", [(3, 0), (0, 3), (2, 2)], ids=str)
 def test_edges_on_a_flat_sheet_are_short_where_its_heights_rise(slope, scheme):
-    corners = corners_on_sheet(scheme, lambda xy: xy @ slope, measure=Measure.EDGE, error=0.25)
+    corners = corners_on_sheet(scheme, lambda xy: xy @ slope, measure="edge", error=0.25)
     length = np.linalg.norm(np.diff(corners[:, [0, 1, 2, 0]], axis=1), axis=2).max()
     assert 0.12 < length <= 0.25 + ROUNDING
 
 
 def triangles_with_heights(surface, error, extent, heights):
     """How many there are. No rate reproduces steep sides."""
-    displacement = DisplacementBound(lambda _, uv: heights(uv), extent)
+    displacement = {"heights": lambda _, uv: heights(uv), "highest": extent}
     with without_warnings():
-        return len(surface.adaptive_sampling(Criterion(Measure.CHORD, error, displacement=displacement), 64).triangles)
+        return len(surface.adaptive_sampling(Criterion("chord", error, **displacement), 64).triangles)
 
 
 def test_a_bump_in_the_middle_of_a_face_is_seen_however_narrow():

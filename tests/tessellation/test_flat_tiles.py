@@ -14,7 +14,7 @@ from mitsuba_subdivision.schemes.scheme import StencilTable
 from mitsuba_subdivision.surface import LimitSurface
 from mitsuba_subdivision.tessellation.adaptive import TileRates, _extent, _normals_to
 from mitsuba_subdivision.tessellation.adaptive_grid import PatchFrames, whole_patches
-from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
+from mitsuba_subdivision.tessellation.criterion import Criterion
 from scipy import sparse
 
 # Samples along each side, less one. They miss this part of an extent at most: a smooth function is lower by an eighth
@@ -129,7 +129,7 @@ def test_a_tile_without_a_normal_is_no_smaller_than_it_is():
     surface = LimitSurface(cage.with_positions(positions), scheme)
     frames = PatchFrames.of(surface.patches)
     error, larger = np.linalg.norm(np.ptp(positions, axis=0)) * (1 + ROUNDING), 0
-    rates = TileRates(scheme, frames, Criterion(Measure.CHORD, error), 64)
+    rates = TileRates(scheme, frames, Criterion("chord", error), 64)
     for tile, values, samples in tiles_of(surface, scheme):
         is_larger = sizes(samples, np.eye(3)) > error
         tiles = whole_patches(np.zeros(len(is_larger)), 4)

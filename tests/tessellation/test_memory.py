@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import LimitSurface
 from mitsuba_subdivision.cage import named_cages
-from mitsuba_subdivision.tessellation.criterion import Criterion, Measure
+from mitsuba_subdivision.tessellation.criterion import Criterion
 from mitsuba_subdivision.tessellation.memory import available_memory
 from mitsuba_subdivision.tessellation.uniform import uniform_table
 from patches.closed_cages import tetrahedron, torus, triangulated
 
 MEGABYTE = 1 << 20
-CHORD = Criterion(Measure.CHORD, 0.1)
+CHORD = Criterion("chord", 0.1)
 
 
 @pytest.fixture
@@ -146,7 +146,7 @@ OF_ANOTHER_CAGE = (np.zeros((5, 3)), np.zeros((9, 3)), np.full((8, 3), np.nan))
             OF_ANOTHER_CAGE,
             r"control points of shape .*; expected finite ones of shape \(8, 3\)",
         ),
-        (lambda _, error: Criterion(Measure.CHORD, error), (-1e-3, np.nan), "expected a number from 0 on"),
+        (lambda _, error: Criterion("chord", error), (-1e-3, np.nan), "expected a number from 0 on"),
     ],
 )
 def test_invalid_tessellation_options_are_errors(make, values, message):
@@ -174,7 +174,7 @@ def test_the_coarsest_triangles_of_a_dense_cage_take_at_most_twice_the_memory_of
         finally:
             tracemalloc.stop()
 
-    makers = (lambda s: s.sampling(2), lambda s: s.adaptive_sampling(Criterion(Measure.CHORD, 100.0)))
+    makers = (lambda s: s.sampling(2), lambda s: s.adaptive_sampling(Criterion("chord", 100.0)))
     # Twice, as what surfaces share stays in memory.
     for _ in range(2):
         (uniform, count), (coarsest, coarsest_count) = map(measured, makers)

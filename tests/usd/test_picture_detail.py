@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mitsuba_subdivision.cage import Attribute, CageWarning, named_cages
+from mitsuba_subdivision.cage import Attribute, CageWarning, cage_of, named_cages
 from mitsuba_subdivision.cage.contents import CageContents
 from mitsuba_subdivision.mitsuba_mesh import points_at
 from mitsuba_subdivision.srgb import decoded
@@ -141,7 +141,7 @@ def test_dense_cages_are_framed_by_points_around_the_surface():
     points = np.concatenate([cage.positions, [[1e3, 0, 0]]])
     contents = replace(cage.contents, positions=points, holes=np.arange(40), scheme="catmull_clark")
     with pytest.warns(CageWarning, match="used by no face"):
-        surface = msub.LimitSurface(msub.ControlCage.from_arrays(**contents.as_arguments()))
+        surface = msub.LimitSurface(cage_of(contents))
     points = Surfaces().points(SceneContents(shapes=[ShapeContents("/shape", contents, _moved(1, 2, 3))]))
     exact = points_at(frame_table(surface).apply(surface.cage.positions)[0], _moved(1, 2, 3))
     for direction in np.random.default_rng(0).normal(size=(50, 3)):

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..device_arrays import mapped
 from ..mesh.connectivity import IntArray, Topology
 from .errors import CageError, CageSource, number_of_such, shortened
 
@@ -151,17 +152,30 @@ class CageContents:
     # Names of the file, its lines, vertices and faces in messages
     source: CageSource = field(default_factory=CageSource)
 
-    @property
-    def material_of_face(self) -> IntArray:
-        """``(n_f,)`` index of each face's material in ``materials``, the last one of several; -1 for none."""
-        material = np.full(len(self.face_sizes), -1)
-        for index, faces in enumerate(self.materials.values()):
-            material[faces] = index
-        return material
 
-    def as_arguments(self) -> dict[str, Any]:
-        """Return the arguments of `ControlCage.from_arrays`, with each rule as a separate argument."""
-        return {item.name: getattr(self, item.name) for item in fields(self) if item.name != "rules"} | {**self.rules}
+def shape_properties(contents: CageContents, mi: Any) -> dict[str, Any]:
+    """Properties of the shape ``subdivision``, with tensors of a variant; see `ControlCage.as_properties`."""
+    tables = {"creases": contents.creases, "corners": contents.corners}
+    indices = {"face_sizes": contents.face_sizes, "face_vertices": contents.face_vertices, "holes": contents.holes}
+    named = [
+        (f"{attribute.interpolation}_{name}", f"face_varying_{name}_indices", attribute)
+        for name, attribute in contents.attributes.items()
+    ]
+    if contents.texcoords is not None:
+        name = "varying_texcoords" if contents.texcoords.interpolation == "varying" else "texcoords"
+        named.append((name, "texcoord_indices", contents.texcoords))
+    for name, name_of_indices, attribute in named:
+        tables[name] = attribute.values
+        if attribute.indices is not None:
+            indices[name_of_indices] = attribute.indices
+    return {
+        # Double precision, as far from the origin single precision would change the normals visibly.
+        "positions": mapped(mi.TensorXd, contents.positions),
+        **{name: mapped(mi.TensorXu, array) for name, array in indices.items() if len(array)},
+        **contents.rules,
+        **({"scheme": contents.scheme} if contents.scheme else {}),
+        **{name: mapped(mi.TensorXf, table) for name, table in tables.items() if len(table)},
+    }
 
 
 def same(a: Any, b: Any, but: frozenset[str] = frozenset()) -> bool:

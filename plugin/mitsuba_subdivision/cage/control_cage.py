@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..device_arrays import mapped
 from ..mesh.connectivity import CreaseMethod, IndexArray, IntArray, Topology
 from ..mesh.cuts import CutMesh, SharpMesh, Sharpness
 from ..mesh.manifold import NonManifold
 from ..mesh.triangulation import triangle_corners
 from ..variants import variant_module
-from .contents import RULES, Attribute, CageContents, validated_attribute
+from .contents import RULES, Attribute, CageContents, shape_properties, validated_attribute
 from .errors import CageError, CageSource
 from .validation import (
     flattened_faces,
@@ -271,8 +270,7 @@ class ControlCage:
         """
         from ..files.formats import read_file
 
-        contents = read_file(path, prim, time, rules)
-        return cls.from_arrays(**{**contents.as_arguments(), **rules}, strict=strict)
+        return cage_of(read_file(path, prim, time, rules), **rules, strict=strict)
 
     def save(self, path: str | Path) -> None:
         """Write to a file: ``.obj``, ``.ply``, ``.usd``, ``.usda`` or ``.usdc``.
@@ -461,20 +459,7 @@ class ControlCage:
         ValueError
             If ``mi`` is something else, the variant does not exist, or no variant is set.
         """
-        variant, contents = variant_module(mi), self.contents
-        tables = {"creases": contents.creases, "corners": contents.corners}
-        indices = {"face_sizes": contents.face_sizes, "face_vertices": contents.face_vertices}
-        if len(contents.holes):
-            indices["holes"] = contents.holes
-        return {
-            # Double precision, as far from the origin single precision would change the normals visibly.
-            "positions": mapped(variant.TensorXd, contents.positions),
-            **{name: mapped(variant.TensorXu, array) for name, array in indices.items()},
-            **contents.rules,
-            **({"scheme": contents.scheme} if contents.scheme else {}),
-            **{name: mapped(variant.TensorXf, table) for name, table in tables.items() if len(table)},
-            **_attribute_properties(contents, variant),
-        }
+        return shape_properties(self.contents, variant_module(mi))
 
     def __repr__(self) -> str:
         return f"ControlCage({self.source.name}, {self.vertex_count} vertices, {self.face_count} faces)"
@@ -487,17 +472,7 @@ class _FlatFaces(NamedTuple):
     vertices: NDArray
 
 
-def _attribute_properties(contents: CageContents, mi: Any) -> dict[str, Any]:
-    """Tensors of the values and of the indices of texture coordinates and attributes."""
-    named = [
-        (f"{attribute.interpolation}_{name}", f"face_varying_{name}_indices", attribute)
-        for name, attribute in contents.attributes.items()
-    ]
-    if contents.texcoords is not None:
-        name = "varying_texcoords" if contents.texcoords.interpolation == "varying" else "texcoords"
-        named.append((name, "texcoord_indices", contents.texcoords))
-    values = {name: mapped(mi.TensorXf, attribute.values) for name, _, attribute in named}
-    indices = {
-        name: mapped(mi.TensorXu, attribute.indices) for _, name, attribute in named if attribute.indices is not None
-    }
-    return values | indices
+def cage_of(contents: CageContents, **options: Any) -> ControlCage:
+    """Build the cage that a file stores; options, as of `ControlCage.from_arrays`, replace the file's."""
+    stored = {item.name: getattr(contents, item.name) for item in fields(contents) if item.name != "rules"}
+    return ControlCage.from_arrays(**{**stored, **contents.rules, **options})

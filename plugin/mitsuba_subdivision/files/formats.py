@@ -122,6 +122,14 @@ def faces_by_name(names: Sequence[str], number: IntArray) -> dict[str, IntArray]
     return {name: its_faces for name, its_faces in zip(index, faces, strict=True) if len(its_faces)}
 
 
+def material_of_face(contents: CageContents) -> IntArray:
+    """``(n_f,)`` index of each face's material in ``contents.materials``, the last one of several; -1 for none."""
+    material = np.full(len(contents.face_sizes), -1)
+    for index, faces in enumerate(contents.materials.values()):
+        material[faces] = index
+    return material
+
+
 def warn_of_losses(path: str | Path, parts: Mapping[str, bool]) -> None:
     """Warn of the parts of a cage, by their names, that are lost in a file of this format."""
     if lost := [name for name, is_lost in parts.items() if is_lost]:

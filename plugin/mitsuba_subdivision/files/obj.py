@@ -21,7 +21,7 @@ from ..cage.errors import CageError, CageSource, shortened, warn
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..whole_file import whole_file
-from .formats import Triangles, faces_by_name, warn_of_losses
+from .formats import Triangles, faces_by_name, material_of_face, warn_of_losses
 
 ROWS = 1 << 16  # Turned into text at once: bounds the memory for numbers as Python objects
 _SPACE, _NEWLINE = b" \n"
@@ -384,7 +384,7 @@ def write_obj(contents: CageContents, path: str | Path) -> None:
 
     Names of materials that are not one line of text are lost, and all but one material of a face.
     """
-    texcoords, owner = contents.texcoords, contents.material_of_face
+    texcoords, owner = contents.texcoords, material_of_face(contents)
     if texcoords is not None and texcoords.interpolation != "face_varying":
         texcoords = None
     tagged = {rule: values.values() for rule, values in RULE_TAGS.values()}

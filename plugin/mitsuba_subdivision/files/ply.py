@@ -20,7 +20,7 @@ from ..cage.errors import CageError, CageSource, shortened, warn
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..whole_file import whole_file
-from .formats import Triangles, faces_by_name, warn_of_losses
+from .formats import Triangles, faces_by_name, material_of_face, warn_of_losses
 
 if TYPE_CHECKING:
     from plyfile import PlyData, PlyElement
@@ -226,7 +226,7 @@ def write_ply(contents: CageContents, path: str | Path) -> None:
     # Numbers of materials, as names of files that were read have them; None if a name has none.
     matches = {name: re.fullmatch(f"material_({_NUMBER})", name) for name in contents.materials}
     numbers = {name: int(match[1]) if match else None if name else -1 for name, match in matches.items()}
-    owner = contents.material_of_face
+    owner = material_of_face(contents)
     warn_of_losses(
         path,
         {

@@ -27,37 +27,36 @@ MOST_RINGS = 4096
 _RINGS: dict[Signature, OneRing] = {}
 
 
-class Surroundings:
+def surroundings(topology: Topology) -> tuple[IndexArray, IndexArray]:
     """The vertices around each vertex of a mesh, face by face counter-clockwise, in one array.
 
     The last vertex of each face is left out: it is the first one of the following face. Around an inner vertex the
-    faces come twice, so that all of them follow any of the first ones.
+    faces come twice, so that all of them follow any of the first ones. Returns ``(n_h,)`` for each half-edge the index
+    in the array at which its face begins, around its first vertex; and the array.
     """
-
-    def __init__(self, topology: Topology) -> None:
-        t = topology
-        is_open, ordered = t.open_fan_start >= 0, list[IntArray]()
-        first, kinds = np.where(is_open, t.open_fan_start, t.vertex_half_edge), 2 * t.vertex_face_count + is_open
-        for kind in np.flatnonzero(np.bincount(kinds)[2:]).tolist():
-            fans = [first[kinds == kind + 2]]
-            for _ in range(kind // 2):
-                fans.append(t.turn.take(fans[-1]))
-            ordered.append(np.stack(fans if kind % 2 else 2 * fans, axis=1).ravel())
-        half_edge = np.concatenate(ordered)
-        counts = np.broadcast_to((t.common_size or t.face_sizes[t.face[half_edge]]) - 2, len(half_edge))
-        begins = ragged.starts(counts)
-        # (n_h,) int32: index in `vertices` at which the half-edge's face begins, around the half-edge's first vertex.
-        # Assigned backwards, as the last assignment is kept.
-        self.start: IndexArray = np.zeros(t.half_edge_count, dtype=np.int32)
-        self.start[half_edge[::-1]] = begins[::-1]
-        self.vertices: IndexArray = np.empty(int(counts.sum()), dtype=np.int32)
-        for step in range(int(counts.max(initial=0))):
-            if not t.common_size:
-                is_long = counts > step
-                half_edge, counts, begins = half_edge[is_long], counts[is_long], begins[is_long]
-            half_edge = t.next.take(half_edge)
-            places = slice(step, None, t.common_size - 2) if t.common_size else begins + step
-            self.vertices[places] = t.face_vertices.take(half_edge)
+    t = topology
+    is_open, ordered = t.open_fan_start >= 0, list[IntArray]()
+    first, kinds = np.where(is_open, t.open_fan_start, t.vertex_half_edge), 2 * t.vertex_face_count + is_open
+    for kind in np.flatnonzero(np.bincount(kinds)[2:]).tolist():
+        fans = [first[kinds == kind + 2]]
+        for _ in range(kind // 2):
+            fans.append(t.turn.take(fans[-1]))
+        ordered.append(np.stack(fans if kind % 2 else 2 * fans, axis=1).ravel())
+    half_edge = np.concatenate(ordered)
+    counts = np.broadcast_to((t.common_size or t.face_sizes[t.face[half_edge]]) - 2, len(half_edge))
+    begins = ragged.starts(counts)
+    start: IndexArray = np.zeros(t.half_edge_count, dtype=np.int32)
+    # Backwards, as the last assignment is kept.
+    start[half_edge[::-1]] = begins[::-1]
+    vertices: IndexArray = np.empty(int(counts.sum()), dtype=np.int32)
+    for step in range(int(counts.max(initial=0))):
+        if not t.common_size:
+            is_long = counts > step
+            half_edge, counts, begins = half_edge[is_long], counts[is_long], begins[is_long]
+        half_edge = t.next.take(half_edge)
+        places = slice(step, None, t.common_size - 2) if t.common_size else begins + step
+        vertices[places] = t.face_vertices.take(half_edge)
+    return start, vertices
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +66,7 @@ class OneRing:
     # The local mesh, which has a border. Half-edge 0 names the element; the vertices of the element come first.
     topology: Topology
     around: list[IntArray]  # Half-edges of the fan at each corner of the element, from the most clockwise one on
-    # (K,) int64: a corner that each vertex is around, and how far it comes after `Surroundings.start` of the corner
+    # (K,) int64: a corner that each vertex is around, and how far it comes after the start of `surroundings` there
     corner: IntArray
     offset: IntArray
     # Local vertices (corner, first, last) for each corner of the element on a border; first and last are its
@@ -113,15 +112,15 @@ class RingTable:
         self._offset = np.concatenate([ring.offset for ring in rings])
 
     @cached_property
-    def _surroundings(self) -> Surroundings:
-        return Surroundings(self.topology)
+    def _surroundings(self) -> tuple[IndexArray, IndexArray]:
+        return surroundings(self.topology)
 
     @cached_property
     def vertices(self) -> IndexArray:
         """The vertices of all groups, flat: for each local vertex of a group, those of all its elements."""
         # Often the largest array of all. The surroundings are half as large, and are not kept for it.
         t, vertices = self.topology, np.empty(self.offsets[-1], dtype=np.int32)
-        surroundings = vars(self).get("_surroundings") or Surroundings(t)
+        start, around = vars(self).get("_surroundings") or surroundings(t)
         bounds = pairwise(self._first_element.tolist()), pairwise(self.offsets.tolist())
         for ring, elements, entries in zip(self.rings, *bounds, strict=True):
             columns = vertices[slice(*entries)].reshape(ring.vertex_count, -1)
@@ -129,9 +128,8 @@ class RingTable:
             for part in ragged.chunks_of(len(half_edges), 8):
                 corners = t.around_faces(half_edges[part], count)
                 t.face_vertices.take(corners, out=columns[:count, part], mode="clip")
-                starts = surroundings.start.take(corners)
-                index = starts.take(ring.corner[count:], axis=0) + ring.offset[count:, None]
-                surroundings.vertices.take(index, out=columns[count:, part], mode="clip")
+                index = start.take(corners).take(ring.corner[count:], axis=0) + ring.offset[count:, None]
+                around.take(index, out=columns[count:, part], mode="clip")
             ring.end_open_fans(t, columns)
         return vertices
 
@@ -141,12 +139,12 @@ class RingTable:
         element: IntArray,  # (s,) int64: index in the group
     ) -> list[IndexArray]:
         """Return the vertices ``(n, K)`` of some elements, for each group that has any of them."""
-        t, surroundings = self.topology, self._surroundings
+        t, (start, around) = self.topology, self._surroundings
         counts, corner_counts = self.vertex_counts[group], self._corner_counts[group]
         corners = t.along_faces(self.half_edges[self._first_element[group] + element], corner_counts)
         place = ragged.ranges(ragged.starts(self.vertex_counts)[group], counts)
         at = corners[np.repeat(ragged.starts(corner_counts), counts) + self._corner[place]]
-        vertices = surroundings.vertices[surroundings.start[at] + self._offset[place]]
+        vertices = around[start[at] + self._offset[place]]
         vertices[ragged.ranges(ragged.starts(counts), corner_counts)] = t.face_vertices[corners]
         sizes = np.bincount(group)
         groups = np.flatnonzero(sizes)
@@ -231,7 +229,7 @@ def _glued_rings(signatures: Sequence[Signature]) -> list[OneRing]:
     rules = np.zeros(len(first), dtype=np.int8)
     rules[vertex[walks[stays]]] = [fan.rule for fan in fans]
 
-    # Vertices around the corners, as in `Surroundings`.
+    # Vertices around the corners, as in `surroundings`.
     counts_ahead = sizes - 2
     begins = ragged.starts(counts_ahead)
     walk, step = np.repeat(np.arange(len(walks)), counts_ahead), ragged.index_in_row(counts_ahead)

@@ -68,16 +68,6 @@ class FrameKind(IntEnum):
     UNEVEN = 2  # At all deeper levels: `uneven_frame`
 
 
-class PieceMap(NamedTuple):
-    """Map from the control points of the element's one-ring to the coefficients of consecutive pieces."""
-
-    first_piece: int
-    # (K_part, K) float64: stencils of the control points of a part's one-ring, so that equal parts of many elements
-    # share ``pieces``. None if ``pieces`` are over the element's one-ring.
-    stencils: FloatArray | None
-    pieces: FloatArray  # (p, m, K_part) float64: coefficients of the pieces' polynomials over control points
-
-
 @dataclass(frozen=True, eq=False)
 class Tip:
     """Levels of tips of one kind that have no pieces, as sums of terms: polynomials times factors times coordinates."""
@@ -103,7 +93,10 @@ class TreeArrays(NamedTuple):
     # each of which begins with the first coordinate, the extraordinary point.
     nodes: IntArray
     piece_count: int
-    maps: tuple[PieceMap, ...]  # Maps to the coefficients of all pieces
+    # Maps to the coefficients of consecutive pieces: the first piece; (K_part, K) stencils of the control points of a
+    # part's one-ring, so that equal parts of many elements share the map, or None for the element's own; and
+    # (p, m, K_part) coefficients of the pieces' polynomials over these control points
+    maps: tuple[tuple[int, FloatArray | None, FloatArray], ...]
     tips: tuple[Tip, ...]
 
 
@@ -237,7 +230,7 @@ def tree_arrays(
     all_stencils = [None] if rows is None else np.split(rows, np.cumsum([part.control_count for part in parts])[:-1])
     for part, stencils in zip(parts, all_stencils, strict=True):
         pieces = _regular_pieces(part)
-        maps.append(PieceMap(piece_count, stencils, pieces))
+        maps.append((piece_count, stencils, pieces))
         piece_count += len(pieces)
     # In nodes of tips, `first` is the index in `PatchTree.tips`.
     tip_nodes, tips = np.flatnonzero(kinds == PartKind.TIP), list[Tip]()
@@ -251,12 +244,11 @@ def tree_arrays(
         stored = np.pad(coordinates, ((0, -len(coordinates) % width), (0, 0))).reshape(-1, width, coordinates.shape[1])
         points = np.broadcast_to(piece.coordinates[0], (len(stored), 1, coordinates.shape[1]))
         pieces = np.concatenate([of_levels @ piece.coordinates, np.concatenate([points, stored], axis=1)])
-        maps.append(PieceMap(piece_count, None, pieces))
+        maps.append((piece_count, None, pieces))
         tips.append(tip)
         piece_count += len(pieces)
     nodes = np.stack([kinds + TURN * turns, first, index, last], axis=1)
-    maps = [piece_map for piece_map in maps if len(piece_map.pieces)]
-    return TreeArrays(nodes, piece_count, tuple(maps), tuple(tips))
+    return TreeArrays(nodes, piece_count, tuple(part for part in maps if len(part[2])), tuple(tips))
 
 
 @lru_cache(maxsize=1024)

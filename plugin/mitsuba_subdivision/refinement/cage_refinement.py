@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cage.contents import RULES, Attribute, CageContents
-from ..cage.control_cage import ControlCage
+from ..cage.control_cage import ControlCage, cage_of
 from ..cage.errors import CageError, CageSource, shortened, without_warnings
 from ..mesh import ragged
 from ..mesh.connectivity import INFINITE, IntArray, Topology, VertexRule
@@ -169,7 +169,7 @@ def built(contents: CageContents) -> ControlCage:
     """Build a cage without warnings."""
     # Problems that cause warnings were already in the coarse cage.
     with without_warnings():
-        return ControlCage.from_arrays(**contents.as_arguments())
+        return cage_of(contents)
 
 
 def _dual(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefinement:

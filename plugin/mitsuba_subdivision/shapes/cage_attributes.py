@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from ..cage import ControlCage
     from ..kernels.channel_kernel import ChannelKernel
     from ..patches.channel import Channel, ChannelLayout
-    from ..tessellation.attribute_table import AttributeTable
     from .displacement import ShapeDisplacement
+    from .mesh_buffers import Triangles
 
 PREFIX = "cage_"
 # Names of attributes whose buffers would be those of every Mitsuba mesh.
@@ -68,7 +68,7 @@ class CageAttributes:
         channels: dict[str, ChannelKernel],  # Attributes that are evaluated at hits
         displacement: ShapeDisplacement | None,
         # Of `retessellate`
-        attributes: AttributeTable,
+        triangles: Triangles,
         names_at_vertices: Container[str],
         # Method that is called with an attribute's name and the gradient by its values, by the same name, after reverse
         # mode has reached these
@@ -101,7 +101,7 @@ class CageAttributes:
             name: BackwardPasses(self._source, f"{PREFIX}{name}", variant.Float)
             for name in (self._channels if dr.is_diff_v(variant.Float) else ())
         }
-        self.retessellate(attributes, names_at_vertices)
+        self.retessellate(triangles, names_at_vertices)
 
     def traverse(self, callback: mi.TraversalCallback) -> None:
         """Expose the parameters."""
@@ -110,14 +110,14 @@ class CageAttributes:
             discontinuity = flags.Discontinuous if name in self.moving else flags.Differentiable
             callback.put(name, values, flags.Differentiable | discontinuity)
 
-    def retessellate(self, attributes: AttributeTable, names: Container[str]) -> None:
+    def retessellate(self, triangles: Triangles, names: Container[str]) -> None:
         """Choose the vertices, which have the attributes that are among ``names``."""
         self._uploaded = {
-            name: shared(_uploaded, self._kind, Content(attributes.values[name].astype(np.float32)))
+            name: shared(_uploaded, self._kind, Content(triangles.attributes[name].astype(np.float32)))
             for name in self._channels
             if name in names
         }
-        self._locations = attributes.layout.locate
+        self._locations = triangles.layout.locate
         self._weights: dict[ChannelLayout, Any] = {}
 
     def update(self, keys: Iterable[str]) -> list[str]:

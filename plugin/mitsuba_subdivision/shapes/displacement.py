@@ -31,7 +31,7 @@ from ..patches.channel import contracts_alike
 from ..patches.patch_samples import PatchSampler
 from ..schemes.domain import FloatArray
 from ..surface import TEXCOORDS, LimitSurface
-from ..tessellation.criterion import DisplacementBound
+from ..tessellation.criterion import HeightsAt
 from ..variants import Variant
 from .cage_attributes import mesh_name
 from .device_state import flat_type, is_recording
@@ -135,8 +135,8 @@ class ShapeDisplacement:
         """Differentiable arrays of the heights and the scale."""
         return [self.scale, *self.heights.variables()]
 
-    def bound(self, to_world: FloatArray) -> DisplacementBound:
-        """Scaled heights in world space as a function of the location, and their bound, for adaptive tessellation."""
+    def in_world(self, to_world: FloatArray) -> tuple[HeightsAt, float]:
+        """`heights` and `highest` of a `Criterion` in world space: the scaled heights by location, and their bound."""
         # The spectral norm is the largest factor by which the linear map scales a length.
         channel, scale = self.channel, self.host_scale * float(np.linalg.norm(to_world[:3, :3], 2))
         float_type = dr.scalar.ArrayXf64 if self.kernel is None else self.kernel.types.float
@@ -147,7 +147,7 @@ class ShapeDisplacement:
             # A constant texture returns one number for all samples.
             return np.broadcast_to(scale * np.array(heights, dtype=np.float64), len(uv))
 
-        return DisplacementBound(heights_at, max(map(abs, self.heights.range(channel))) * abs(scale))
+        return heights_at, max(map(abs, self.heights.range(channel))) * abs(scale)
 
 
 class DisplacedVertices:

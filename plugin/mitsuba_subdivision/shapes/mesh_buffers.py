@@ -14,6 +14,7 @@ from ..device_arrays import mapped
 from ..kernels.array_types import ArrayTypes, FloatBuffer, IndexBuffer, LaterArrays
 from ..mesh.connectivity import IntArray
 from ..mesh.shared import Content, SharedArray, shared, shared_by_key
+from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 from ..variants import Variant
 from .derivatives import BackwardPasses
@@ -22,7 +23,7 @@ from .placement import Placement
 if TYPE_CHECKING:
     from ..kernels.surface_kernel import SurfaceKernel
     from ..kernels.vertex_kernel import VertexKernel
-    from ..tessellation.attribute_table import AttributeLayout, AttributeTable
+    from ..tessellation.attribute_table import AttributeLayout
     from ..tessellation.vertex_table import VertexTable
     from .displacement import DisplacedVertices, ShapeDisplacement
     from .exact_shading import ExactShading
@@ -37,7 +38,8 @@ class Triangles(NamedTuple):
     """The triangles of a shape."""
 
     table: VertexTable
-    attributes: AttributeTable  # At the vertices of the mesh, which have copies along seams of attributes
+    layout: AttributeLayout  # Vertices of the mesh, which have copies along seams of attributes
+    attributes: dict[str, FloatArray]  # (n, k) float64: values at these vertices, by name
     kept: IntArray | None  # (n,) int64: indices of the triangles of the mesh; None for all
 
 
@@ -79,7 +81,7 @@ class MeshBuffers:
 
     def retessellate(self, triangles: Triangles) -> None:
         """Choose the triangles, and the vertices to evaluate."""
-        self.table, self.layout, self._kept = triangles.table, triangles.attributes.layout, Content(triangles.kept)
+        self.table, self.layout, self._kept = triangles.table, triangles.layout, Content(triangles.kept)
         table, layout = self.table, self.layout
         self._kernel: VertexKernel | None = None
         if self._types is not None and not self._is_sampled:

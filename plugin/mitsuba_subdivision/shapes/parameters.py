@@ -32,7 +32,7 @@ from .parameter_table import PARAMETER_OF_NAME, errors_about, value_of
 from .placement import checked_matrix
 
 if TYPE_CHECKING:
-    from ..tessellation.criterion import DisplacementBound, Sensor
+    from ..tessellation.criterion import HeightsAt, Sensor
     from ..tessellation.vertex_table import VertexTable
 
 TEXCOORD_INDICES = "texcoord_indices"
@@ -68,15 +68,16 @@ class Tessellation:
         surface: LimitSurface,
         control_points: NDArray,  # (n, 3) float64 in object space
         to_world: NDArray,  # (4, 4) float64
-        bound: DisplacementBound | None,  # In world space
+        displacement: tuple[HeightsAt, float] | None,  # Heights in world space, and the highest, as of `Criterion`
     ) -> VertexTable:
         """Prepare the tessellation. A uniform one does not depend on the control points."""
         if self.limit is None:
             return surface.sampling(self.rate)
         criterion = self.criterion
-        if bound is not None:
+        if displacement is not None:
+            heights, highest = displacement
             # The limit holds everywhere, as silhouettes are unknown.
-            criterion = replace(criterion, outline=None, displacement=bound)
+            criterion = replace(criterion, outline=None, heights=heights, highest=highest)
         world_points = control_points @ to_world[:3, :3].T + to_world[:3, 3]
         with errors_about(self.limit):
             return surface.adaptive_sampling(criterion, self.rate, world_points)
@@ -111,14 +112,11 @@ class Parameters:
     face_normals: bool
     evaluator: Evaluator
     sample_offset: float  # Parameters u = v at which extraordinary vertices are sampled
+    # Whether vertices are samples by another evaluator, or beside extraordinary vertices, for comparison
+    is_sampled: bool
     displacement: Any  # Heights: a texture, or the name ``vertex_NAME`` of a mesh attribute; None without displacement
     displacement_scale: float
     shown: NDArray[np.bool_] | None  # (n_f,) bool: elements whose triangles are kept; None for all
-
-    @property
-    def is_sampled(self) -> bool:
-        """Whether vertices are samples by another evaluator, or beside extraordinary vertices, for comparison."""
-        return self.evaluator != "stabilized" or self.sample_offset > 0
 
 
 def read_parameters(props: mi.Properties) -> Parameters:
@@ -145,7 +143,8 @@ def read_parameters(props: mi.Properties) -> Parameters:
             'parameters "face_normals" and "shading" contradict each other; expected flat or exact shading'
         )
     displacement, scale = _displacement(props)
-    if evaluator != "stabilized" or offset:
+    is_sampled = evaluator != "stabilized" or offset > 0
+    if is_sampled:
         other = "evaluator" if evaluator != "stabilized" else "sample_offset"
         if displacement is not None:
             raise ValueError(
@@ -165,9 +164,8 @@ def read_parameters(props: mi.Properties) -> Parameters:
         source = os.path.basename(str(props["filename"]))
     surface = LimitSurface(cage, scheme)
     shown = _shown(props, surface)
-    return Parameters(
-        surface, source, to_world, tessellation, shading, face_normals, evaluator, offset, displacement, scale, shown
-    )
+    form = shading, face_normals, evaluator, offset, is_sampled
+    return Parameters(surface, source, to_world, tessellation, *form, displacement, scale, shown)
 
 
 def _shown(props: mi.Properties, surface: LimitSurface) -> NDArray[np.bool_] | None:
@@ -237,13 +235,13 @@ def _tessellation(props: mi.Properties) -> Tessellation:
             f"an adaptive tessellation has {' and '.join(limits) or 'no limit'}; expected exactly one of "
             f"{', '.join(LIMITS)}"
         )
-    from ..tessellation.criterion import Criterion, Measure
+    from ..tessellation.criterion import Criterion
 
     (limit,) = limits
     is_of_pixels, fits_outline = limit == "pixel_error", value_of(props, "outline") == "sensor"
     sensor = _sensor(props, "outline" if fits_outline else "pixel_error" if is_of_pixels else None)
     criterion = Criterion(
-        Measure.EDGE if limit == "max_edge" else Measure.CHORD,
+        "edge" if limit == "max_edge" else "chord",
         float(value_of(props, limit)),
         sensor if is_of_pixels else None,
         sensor if fits_outline else None,

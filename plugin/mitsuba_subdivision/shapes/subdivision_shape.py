@@ -112,7 +112,7 @@ def make_subdivision(
                 interaction_hook(variant).attach(self, self._exact)
             attributes = mesh_attributes(surface.cage)
             exposed = [name for name in (TEXCOORDS, *attributes) if name in surface.attribute_names]
-            vertices = triangles.attributes, self._at_vertices
+            vertices = triangles, self._at_vertices
             self._cage = CageAttributes(
                 variant, surface, exposed, channels, self._displacement, *vertices, WeakMethod(self.renew_attribute)
             )
@@ -133,12 +133,12 @@ def make_subdivision(
         def _triangles(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> Triangles:
             parameters, surface = self._parameters, self._parameters.surface
             is_adaptive = self._tessellation.limit is not None
-            bound = self._displacement.bound(to_world) if self._displacement is not None and is_adaptive else None
-            table = self._tessellation.table(surface, control_points, to_world, bound)
+            heights = self._displacement.in_world(to_world) if self._displacement is not None and is_adaptive else None
+            table = self._tessellation.table(surface, control_points, to_world, heights)
             kept = None if parameters.shown is None else np.flatnonzero(parameters.shown[table.element])
             # Displaced vertices are averaged over copies along all seams.
             names = self._at_vertices if self._displacement is None else None
-            return Triangles(table, surface.attribute_table(table, names), kept)
+            return Triangles(table, *surface.attribute_table(table, names), kept)
 
         def _assemble(self, *, moves_points: bool) -> None:
             buffers = self._mesh.evaluated(self.control_points, moves_points=moves_points)
@@ -166,7 +166,7 @@ def make_subdivision(
             triangles = self._triangles(points, to_world)
             if self._exact is not None:
                 self._exact.retessellate(triangles)
-            self._cage.retessellate(triangles.attributes, self._at_vertices)
+            self._cage.retessellate(triangles, self._at_vertices)
             self._mesh.retessellate(triangles)
             self._texture_scene = None
             self._assemble(moves_points=True)

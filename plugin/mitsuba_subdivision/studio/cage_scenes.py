@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage import CageError, ControlCage, named_cages
+from ..cage import CageError, ControlCage, cage_of, named_cages
 from ..cage.contents import same_topology
 from ..cage.errors import CageSource, noting_warnings, shortened, warn, without_warnings
 from ..files.formats import FORMATS, read_file
@@ -180,7 +180,7 @@ class CageScenes(SceneSource[PosedModel]):
             if self._first is not None and same_topology(contents, self._first[0]):
                 # Frames of the same topology have the same warnings.
                 return self._first[1], np.asarray(contents.positions, dtype=np.float64)
-            cage = ControlCage.from_arrays(**{**contents.as_arguments(), **self._rules})
+            cage = cage_of(contents, **self._rules)
             model = Model(cage, path, prim=self._prim, time=time, scheme=self._scheme)
         for message in () if number in self._seen else noted:
             warn(message)

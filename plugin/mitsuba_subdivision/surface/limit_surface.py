@@ -28,7 +28,7 @@ from ..patches.polynomial_pieces import ElementBounds, SurfacePieces
 from ..refinement.adapted_scheme import adapted_scheme
 from ..schemes import Scheme
 from ..schemes.domain import FloatArray
-from ..tessellation.attribute_table import AttributeTable
+from ..tessellation.attribute_table import AttributeLayout, attribute_table
 from ..tessellation.uniform import uniform_table
 from ..tessellation.vertex_table import Tessellation, VertexMatrices, VertexTable
 from ..variants import variant_name
@@ -536,9 +536,9 @@ class LimitSurface:
         """
         table = self.sampling(rate)
         positions, normals = self.sample_vertices(table, evaluator, dtype, sample_offset)
-        attributes = self.attribute_table(table)
-        values = {name: attribute_values.copy() for name, attribute_values in attributes.values.items()}
-        mesh, texcoords = attributes.layout, values.pop(TEXCOORDS, None)
+        mesh, shared_values = self.attribute_table(table)
+        values = {name: attribute_values.copy() for name, attribute_values in shared_values.items()}
+        texcoords = values.pop(TEXCOORDS, None)
         vertices = mesh.gathered(positions), mesh.gathered(normals)
         return Tessellation(*vertices, mesh.triangles, table.element, texcoords, values)
 
@@ -561,7 +561,9 @@ class LimitSurface:
         points, *tangents = stencil_matrices(self.patches, *table.locations(), limit_stencils, 3)
         return VertexMatrices(points[table.weld_target], *tangents)
 
-    def attribute_table(self, table: VertexTable, names: Iterable[str] | None = None) -> AttributeTable:
+    def attribute_table(
+        self, table: VertexTable, names: Iterable[str] | None = None
+    ) -> tuple[AttributeLayout, dict[str, FloatArray]]:
         """Evaluate the cage's texture coordinates and attributes, or those named, at the vertices of a tessellation.
 
         Raises
@@ -570,7 +572,7 @@ class LimitSurface:
             If the scheme has no rules for one of them.
         """
         channels = {name: self.channel(name) for name in (self.attribute_names if names is None else names)}
-        return AttributeTable.build(table, self.patches, channels)
+        return attribute_table(table, self.patches, channels)
 
     def sample_vertices(
         self, table: VertexTable, evaluator: Evaluator, dtype: DTypeLike, sample_offset: float

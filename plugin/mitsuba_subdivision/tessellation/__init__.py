@@ -13,7 +13,7 @@ mesh vertex        A vertex of `PatchTable.topology`: the cage cut along its cre
                    on each side. Attributes have separate meshes, cut along their seams as well.
 sample             A point of a patch's grid. All patches of a class have the same samples.
 vertex             A vertex of the tessellation. Neighbouring patches share vertices; one of the patches evaluates them.
-split vertex       A vertex of the tessellation with attributes (`AttributeTable`), and of Mitsuba's mesh: vertices on
+split vertex       A vertex of the tessellation with attributes (`AttributeLayout`), and of Mitsuba's mesh: vertices on
                    seams are split into a copy for each side.
 =================  ====================================================================================================
 

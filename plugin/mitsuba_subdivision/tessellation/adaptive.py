@@ -39,7 +39,6 @@ from .adaptive_grid import (
 from .criterion import (
     Cone,
     Criterion,
-    Measure,
     cone_around,
     dot,
     least_product,
@@ -283,7 +282,7 @@ class TileRates:
         height_range = np.zeros(len(tiles))
         if heights is not None:
             height_range = np.nanmax(heights, axis=(0, 1)) - np.nanmin(heights, axis=(0, 1))
-        if self.criterion.measure is Measure.EDGE:
+        if self.criterion.measure == "edge":
             extent = _extent(kind.hull, values, np.eye(3)[..., None] * np.ones(len(tiles)))
             return np.hypot(extent, height_range) <= limit
         # The displacement uses up a part of the limit.
@@ -342,8 +341,8 @@ class TileRates:
 
     def _heights(self, tiles: Tiles) -> FloatArray | None:
         """``(n, n, t)`` heights of the displacement over tiles, if any, by v and by u; NaN outside of triangles."""
-        displacement = self.criterion.displacement
-        if displacement is None:
+        heights_at = self.criterion.heights
+        if heights_at is None:
             return None
         steps = HEIGHT_SAMPLES - 1
         column, row = self.scheme.domain.indices(steps).T
@@ -352,7 +351,7 @@ class TileRates:
         uv = in_patch(tiles, tile, np.repeat([column / steps, row / steps], len(tiles), axis=1))
         uv *= self.frames.scale[self.frames.topology.face[corner]]
         heights = np.full((HEIGHT_SAMPLES, HEIGHT_SAMPLES, len(tiles)), np.nan)
-        heights[row, column] = displacement.heights(corner, uv.T).reshape(len(row), -1)
+        heights[row, column] = heights_at(corner, uv.T).reshape(len(row), -1)
         return heights
 
 
@@ -405,7 +404,7 @@ def feature_edges(
     adjacent surfaces keep the curve within the limit, unless they may be coarse.
     """
     t, names = frames.topology, frames.edge
-    if criterion.measure is Measure.EDGE:
+    if criterion.measure == "edge":
         return np.zeros(t.half_edge_count, dtype=bool)
     # Squared length of the sum of the normals of the elements beside each edge.
     squares = sum(np.square(np.bincount(names, x.take(t.face))) for x in _element_normals(patches, points))

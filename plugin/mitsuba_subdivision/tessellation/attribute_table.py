@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -84,22 +83,17 @@ def _interpolated(table: VertexTable, channel: Channel) -> FloatArray:
     return table.interpolated(control_values)
 
 
-@dataclass(frozen=True, eq=False)
-class AttributeTable:
-    """Attributes of a tessellation, evaluated at its vertices."""
+def attribute_table(
+    table: VertexTable, patches: PatchTable, channels: Mapping[str, Channel]
+) -> tuple[AttributeLayout, dict[str, FloatArray]]:
+    """Evaluate attributes at the vertices of a tessellation.
 
-    layout: AttributeLayout  # Shared by tables of the same tessellation and the same channel layouts
-    # dict of str to (n, k) float64: values at the vertices by the name of the attribute; read-only, as tables with
-    # equal values share them
-    values: Mapping[str, FloatArray]
-
-    @classmethod
-    def build(cls, table: VertexTable, patches: PatchTable, channels: Mapping[str, Channel]) -> AttributeTable:
-        """Evaluate attributes in float64."""
-        layouts = tuple(channel.layout for channel in channels.values())
-        layout, values = shared(AttributeLayout, table, patches, layouts), {}
-        for name, channel in channels.items():
-            key = AttributeTable, layout, channel.layout, Content(channel.values)
-            values[name] = shared_by_key(key, partial(layout.evaluated, channel))
-            values[name].flags.writeable = False
-        return cls(layout, values)
+    Returns the layout, shared by tessellations with the same channel layouts; and ``(n, k)`` float64 values by name,
+    read-only, as attributes with equal values share them.
+    """
+    layout, values = shared(AttributeLayout, table, patches, tuple(c.layout for c in channels.values())), {}
+    for name, channel in channels.items():
+        key = AttributeLayout, layout, channel.layout, Content(channel.values)
+        values[name] = shared_by_key(key, partial(layout.evaluated, channel))
+        values[name].flags.writeable = False
+    return layout, values

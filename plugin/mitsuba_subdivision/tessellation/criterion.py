@@ -8,9 +8,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from enum import Enum, auto
 from math import sqrt
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +31,9 @@ COARSE = 8.0
 # coarse triangles might project.
 BESIDE_OUTLINE = np.radians(4)
 
+Measure = Literal["chord", "edge"]
+HeightsAt = Callable[[IntArray, FloatArray], FloatArray]
+
 # Least divisor. Not NumPy's finfo, of which NumPy before 2.3 warns where Dr.Jit computes without subnormals.
 TINY = sys.float_info.min
 # Excess over an integer that counts as rounding error and does not round a rate up.
@@ -40,13 +42,6 @@ RATE_ROUNDING = 1e-9
 MOST = 1 << 20
 # Directions whose sine is below this are parallel.
 PARALLEL = 1e-9
-
-
-class Measure(Enum):
-    """The limited quantity: the distance between triangles and surface, or the length of edges."""
-
-    CHORD = auto()
-    EDGE = auto()
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,25 +75,18 @@ class Sensor:
 
 
 @dataclass(frozen=True, eq=False)
-class DisplacementBound:
-    """Heights of a displacement, and their bound."""
-
-    # Maps samples, given as for `PatchSampler.evaluate`, to heights ``(s,)``
-    heights: Callable[[IntArray, FloatArray], FloatArray]
-    # Largest distance that any point is displaced; for a texture that is no bitmap, the largest among samples
-    extent: float
-
-
-@dataclass(frozen=True, eq=False)
 class Criterion:
     """An error limit for all triangles of a tessellation. Raises ValueError if it is negative or not a number."""
 
-    measure: Measure
+    measure: Measure  # The limited quantity: the distance between triangles and surface, or the length of edges
     error: float  # The limit, in pixels of the ``sensor`` if there is one
     sensor: Sensor | None = None
     # Triangles that this sensor cannot see edge-on, and that are hence at no silhouette, may be coarse.
     outline: Sensor | None = None
-    displacement: DisplacementBound | None = None  # At whose samples the limit is checked
+    # Maps samples, given as for `PatchSampler.evaluate`, to heights ``(s,)`` of a displacement, at which the limit is
+    # checked; and the largest distance that any point is displaced, or any of many samples of a texture
+    heights: HeightsAt | None = None
+    highest: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.error >= 0:
@@ -108,8 +96,7 @@ class Criterion:
         """``(.., t)`` the limit for parts of the surface in boxes ``(.., 3, t)``, by default with any normals."""
         limit = np.full(lower[..., 0, :].shape, float(self.error))
         if self.sensor is not None:
-            extent = 0.0 if self.displacement is None else self.displacement.extent
-            limit *= self.sensor.pixel_size(lower - extent, upper + extent)
+            limit *= self.sensor.pixel_size(lower - self.highest, upper + self.highest)
         if self.outline is not None and normals is not None:
             limit[~self.outline.may_see_outline(lower, upper, normals)] *= COARSE
         return limit
@@ -123,7 +110,7 @@ class Criterion:
         """
         (u, shortest_u), (v, shortest_v) = map(tangent_cone, derivatives[:2])
         normals = normal_cone(u, v)
-        if self.measure is Measure.EDGE:
+        if self.measure == "edge":
             form = _edge_form(derivatives[0], derivatives[1], corner_count)
         else:
             form = _chord_form(derivatives[2:], np.minimum(shortest_u, shortest_v), normals, corner_count)
@@ -133,10 +120,10 @@ class Criterion:
         """``(3, t)`` contribution to `form` of heights ``(n, n, t)`` over tiles, by v and u; NaN beyond a triangle."""
         steps, is_triangle = len(heights) - 1, corner_count == 3
         u, v = (steps * np.diff(heights, axis=axis) for axis in (1, 0))
-        if self.measure is Measure.EDGE and is_triangle:
+        if self.measure == "edge" and is_triangle:
             u, v = u[:-1], v[:, :-1]
             form = _isotropic(4 * np.nanmax(np.square([u, v, u - v]), axis=(0, 1, 2)))
-        elif self.measure is Measure.EDGE:
+        elif self.measure == "edge":
             a, c = (np.abs(d).max(axis=(0, 1)) for d in (u, v))
             form = np.stack([a**2, a * c, c**2])
         else:
@@ -150,7 +137,7 @@ class Criterion:
 
     def _relative(self, form: FloatArray, limit: FloatArray) -> FloatArray:
         with np.errstate(over="ignore"):
-            return form / np.maximum(limit**2 if self.measure is Measure.EDGE else limit, TINY)
+            return form / np.maximum(limit**2 if self.measure == "edge" else limit, TINY)
 
     def segments(self, second: FloatArray, points: FloatArray) -> IntArray:
         """``(t,)`` segments that keep curves on surfaces ``(b, 3, t)`` within the limit, from second derivatives."""
