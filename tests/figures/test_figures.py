@@ -190,9 +190,7 @@ def test_figures_take_cages_of_users(name, options, users_cage):
     assert path.read_bytes() != first
 
 
-def test_files_of_figures_contain_version_command_and_cage(
-    variant_llvm_ad_rgb, coarse, options, users_cage, monkeypatch
-):  # noqa: ARG001
+def test_figures_contain_version_command_and_cage(variant_llvm_ad_rgb, coarse, options, users_cage, monkeypatch):  # noqa: ARG001
     pypdf = pytest.importorskip("pypdf")
     monkeypatch.chdir(users_cage.parent)
     paths = FIGURES["subdivision"](options(cage=Path("own.obj"), width=COLUMN))
