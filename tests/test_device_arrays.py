@@ -96,7 +96,7 @@ def test_a_user_s_array_is_taken_over_in_place_unless_it_has_derivatives(variant
 
 
 @pytest.mark.parametrize("shading", ["vertex", "exact"])
-def test_parameters_that_a_user_assigns_are_taken_over(shading, variant_llvm_ad_rgb):  # noqa: ARG001
+def test_assigned_parameters_are_copied(shading, variant_llvm_ad_rgb):  # noqa: ARG001
     cube = named_cages.cube()
     shape = mi.load_dict({"type": "subdivision", **cube.as_properties(mi), "shading": shading})
     parameters, points = mi.traverse(shape), cube.positions.ravel().astype(np.float32)

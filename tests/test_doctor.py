@@ -22,7 +22,7 @@ def test_the_report_lists_variants_and_packages(monkeypatch, capsys):
         assert f"\n{package} " in told
 
 
-def test_a_variant_that_fails_is_a_status_of_one(monkeypatch, capsys):
+def test_failing_variants_exit_with_status_1(monkeypatch, capsys):
     crashed = {"works": False, "problem": "the process crashed (SIGABRT)"}
     monkeypatch.setattr(doctor, "try_variant", lambda *_: crashed)
     assert main(["doctor", "--json"]) == 1

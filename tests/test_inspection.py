@@ -36,7 +36,7 @@ def test_a_sheet():
     assert inspected["warnings"] == []
 
 
-def test_the_box_is_that_of_the_vertices_of_faces(tmp_path, capsys):
+def test_the_box_contains_vertices_of_faces_only(tmp_path, capsys):
     with pytest.warns(CageWarning):
         cage = ControlCage([[9, 9, 9], *(cube().positions * [1, 2, 3])], 1 + np.array(faces_of(cube())))
     assert inspect(LimitSurface(cage))["bounding_box"] == ([-1, -2, -3], [1, 2, 3])

@@ -88,7 +88,7 @@ def test_libraries_of_a_wheel_are_found_where_its_packages_are(monkeypatch, tmp_
     assert str(tmp_path / libraries / "libLLVM.so.19.1") in llvm._libraries(llvm._python_folders())
 
 
-def test_a_folder_with_a_star_stands_for_all_whose_names_begin_so(tmp_path):
+def test_a_folder_with_a_star_matches_names_by_their_beginning(tmp_path):
     for version, folder in ((18, "llvm-18/lib"), (19, "llvm-19/lib"), (20, "llvm-20/bin"), (21, "other-21/lib")):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / f"libLLVM-{version}.so").touch()
@@ -175,7 +175,7 @@ LLVM = "mi.set_variant('llvm_ad_rgb');"
     ],
     ids=["user's setting", "imported late", "imported after set_variant"],
 )
-def test_a_library_that_aborts_is_warned_of_once_an_llvm_variant_is_set(code, message):
+def test_aborting_libraries_warn_when_an_llvm_variant_is_set(code, message):
     done = run(code, DRJIT_LIBLLVM_PATH=OLD_LIBRARY)
     assert done.returncode == 0, done.stderr
     assert done.stderr.startswith("so far\n") == (SCALAR in code)

@@ -153,7 +153,7 @@ def test_useless_and_harmful_options_are_refused_before_writing(folder, capsys, 
 
 
 @pytest.mark.usefixtures("folder")
-def test_a_variant_that_does_not_run_is_one_line(capsys, monkeypatch):
+def test_failing_variants_are_one_line(capsys, monkeypatch):
     monkeypatch.setattr("drjit.has_backend", lambda _: False)
     assert main([*RENDER, "--variant", "cuda_ad_rgb"]) == 1
     expected = "mitsuba-subdivision: error: variant cuda_ad_rgb needs an NVIDIA GPU, and Dr.Jit finds none\n"
@@ -272,7 +272,7 @@ def terminal(monkeypatch):
     return replaced
 
 
-def test_a_line_counts_and_is_wiped_and_messages_stand_on_lines_of_their_own(terminal):
+def test_progress_counts_on_one_line_is_wiped_and_leaves_messages_on_other_lines(terminal):
     stream = terminal(Terminal())
     assert list(counted("abc", "Letters")) == ["a", "b", "c"]
     assert "Letters" in stream.getvalue()

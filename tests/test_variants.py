@@ -30,7 +30,7 @@ def made(name, given):
     return FUNCTIONS[name](given)
 
 
-def test_these_are_all_public_functions_that_ask_for_mitsuba():
+def test_all_public_functions_with_a_variant_are_tested():
     public = {name: getattr(msub, name) for name in msub.__all__}
     for name, cls in [(name, value) for name, value in public.items() if inspect.isclass(value)]:
         methods = {member: value for member, value in vars(cls).items() if not member.startswith("_")}

@@ -157,7 +157,7 @@ def test_pipes_are_written_to(tmp_path, name):
 
 
 @pytest.mark.parametrize("stem", ["a" * 251, "ä" * 125])
-def test_names_as_long_as_can_be(tmp_path, stem):
+def test_names_of_maximum_length_are_written(tmp_path, stem):
     path = tmp_path / f"{stem}.txt"
     require_writable(path)
     write(path)

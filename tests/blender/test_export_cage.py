@@ -93,7 +93,7 @@ def test_surfaces_are_blenders_with_every_rule_of_its_modifier(scene):
     assert max(wrong.values()) < TOLERANCE, wrong
 
 
-def test_rules_of_the_modifier_matter_in_this_scene(scene):
+def test_rules_of_the_modifier_change_this_scene(scene):
     """So that the test above would see a wrong one."""
     *_, answers, _ = scene
     rows = [rows for name, rows in answers.items() if name != "mirrored"]
@@ -101,7 +101,7 @@ def test_rules_of_the_modifier_matter_in_this_scene(scene):
     assert min(np.abs(one - other).max() for one, other in itertools.combinations(rows, 2)) > DIFFERENCE
 
 
-def test_objects_are_placed_and_told(scene):
+def test_objects_are_placed_and_losses_printed(scene):
     """Transforms reach the cage, hidden objects are left out, and modifiers below the subdivision are told."""
     _, usda, _, told = scene
     base, moved = cage_of(usda, "ALL_PRESERVE_BOUNDARIES"), cage_of(usda, "Würfel 1.001")
@@ -196,7 +196,7 @@ def test_points_are_those_of_a_render(shown):
     assert 'object "thick": modifiers below "Subsurf" are left out: Solidify' in told
 
 
-def test_what_moves_has_samples(shown):
+def test_animated_properties_have_samples(shown):
     stage, _, _ = shown
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (1, 3)
 
@@ -243,7 +243,7 @@ def test_images_are_beside_the_file(look):
     assert all(Path(file.resolvedPath).is_file() for file in files)
 
 
-def test_what_is_left_out_is_told(look):
+def test_omissions_are_printed(look):
     told = look[2]
     for what in (
         'light "Lamp": left out: its spread',

@@ -73,7 +73,7 @@ class NamedCage(ControlCage):
         return self.positions.mean(axis=0)
 
 
-def test_new_positions_keep_the_class_and_the_topology_and_nothing_that_was_cached():
+def test_new_positions_keep_class_and_topology_but_no_cached_values():
     cage = NamedCage.from_arrays(cube().positions, cube().topology.face_sizes, cube().face_vertices)
     given = set(vars(cage))
     assert len(cage.cut_mesh.topology.face_sizes) == 6
@@ -151,7 +151,7 @@ def test_malformed_attributes_are_errors_with_their_names(options, message):
         tagged(cube(), **options)
 
 
-def test_a_cage_of_its_own_contents_is_the_same(np_rng):
+def test_a_cage_from_its_contents_is_equal(np_rng):
     base = extraordinary(5, closed=False)
     indices = np_rng.integers(7, size=len(base.face_vertices))
     values = {"texcoords": Attribute(np_rng.random((7, 2)), "face_varying", indices)}

@@ -130,7 +130,7 @@ def test_any_element_and_corner_match_explicit_refinement(scheme, name, np_rng):
     assert curvature_error(curvatures(computed), exact["curvature"].T).max() <= CURVATURE
 
 
-def test_translation_changes_normals_by_no_more_than_rounding_the_cage_does(exact):
+def test_translation_changes_normals_by_rounding_of_the_cage_at_most(exact):
     distance = 1e6
     shift = distance * np.array([0.6, -0.48, 0.64])
     moved = exact.cage.with_positions(exact.cage.positions + shift)

@@ -55,7 +55,7 @@ PATCHES = {
 
 
 @pytest.mark.parametrize(("scheme", "cage"), PATCHES.values(), ids=PATCHES)
-def test_signs_of_eigenvectors_do_not_matter(scheme, cage, np_rng, monkeypatch):
+def test_results_do_not_depend_on_signs_of_eigenvectors(scheme, cage, np_rng, monkeypatch):
     surface = LimitSurface(cage, scheme)
     places = at_corners(surface, np_rng)
     expected = surface.evaluate(*places)

@@ -113,7 +113,7 @@ def test_a_doubled_fan_has_no_normal_at_the_fold_and_is_plane_within(size, bend,
 
 @EVERY_SIZE
 @pytest.mark.parametrize("make", [pillow, lens])
-def test_with_a_sharp_rim_each_side_has_its_normal_everywhere(size, make):
+def test_each_side_of_a_sharp_rim_has_its_normal(size, make):
     normals, _ = normals_on_every_path(make(size, creases=rim(size, INFINITE)))
     assert not assert_unit_or_zero_alike(normals).any()
     heights = normals["table"] @ TURN[:, 2]
@@ -187,7 +187,7 @@ def test_thin_cages_have_their_normals(thickness):
 
 
 @pytest.mark.parametrize("size", [1e-12, 1e12])
-def test_the_size_of_a_cage_does_not_matter(size):
+def test_results_do_not_depend_on_the_size_of_a_cage(size):
     for cage in (pillow(5, 0.3), bumpy(cube(), 2)):
         normals, _ = normals_on_every_path(cage)
         scaled, _ = normals_on_every_path(cage.with_positions(size * cage.positions))

@@ -103,7 +103,7 @@ def test_float32_curvature_is_that_of_float64_within_its_precision(scheme):
     assert curvature_error(curvatures(samples), exact.curvature).max() < 1e-4
 
 
-def test_one_derivative_leaves_second_derivatives_and_curvature_out():
+def test_first_derivatives_come_without_second_ones_and_curvature():
     samples = LimitSurface(extraordinary(5)).evaluate(0, [[0.5, 0.5]])
     assert samples.d2p_duu is None
     assert samples.gaussian_curvature is None

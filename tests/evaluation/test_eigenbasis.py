@@ -129,7 +129,7 @@ def test_basis_finds_hidden_blocks(sizes, hidden):
     assert len(right) - len(matrix) <= 4 * len(sizes)
 
 
-def test_of_opposite_eigenvalues_the_positive_comes_first():
+def test_the_positive_of_opposite_eigenvalues_comes_first():
     # Which of the two has the greater modulus is up to rounding.
     _, hidden = HIDDEN["opposite to the subdominant"]
     for seed in range(8):

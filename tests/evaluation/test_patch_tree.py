@@ -92,7 +92,7 @@ def test_scheme_that_isolates_nothing_is_refused():
         element_stencils(NeverIsolates(), Signature("face", (Fan((5,) * 3),) * 5), np.zeros((1, 2)))
 
 
-def test_weights_that_do_not_sum_to_one_are_an_error():
+def test_weights_must_sum_to_one():
     halved = ChangedCatmullClark("halved", lambda matrix, _: 0.5 * matrix)
     with pytest.raises(SchemeError, match=r"halved: a refined vertex near a face .* sum to 0\.5; expected 1"):
         refined_children(halved, [isolated_signature(SCHEME, 5)])
@@ -104,7 +104,7 @@ class Skewed(CatmullClark):
         return [(ParameterMap(domain.matrix, domain.offset + 0.25), child) for domain, child in parts]
 
 
-def test_children_that_are_no_copies_of_the_domain_are_an_error():
+def test_children_must_be_copies_of_the_domain():
     patches = PatchTable(cube().topology, Skewed())
     with pytest.raises(SchemeError, match="a child's domain is none of"):
         patch_trees(patches.scheme, [patches.classes[0].signature])
@@ -119,7 +119,7 @@ def test_children_that_are_no_copies_of_the_domain_are_an_error():
     ],
     ids=["divided", "sampled"],
 )
-def test_patches_that_no_refinement_isolates_are_an_error(use, monkeypatch):
+def test_patches_that_stay_irregular_are_an_error(use, monkeypatch):
     monkeypatch.setattr("mitsuba_subdivision.evaluation.patch_tree.irregular_patch", lambda *_: None)
     scheme, (signature, *_) = classes(surface_named("cube"))
     with pytest.raises(SchemeError, match="expected a scheme that isolates extraordinary points"):

@@ -94,7 +94,7 @@ def test_a_users_scheme_works_in_a_scene(variant_scalar_rgb):  # noqa: ARG001
     assert 'scheme = "warren"' in str(shape)
 
 
-def test_a_scheme_may_state_every_rule_itself_and_be_used_without_registering():
+def test_schemes_may_define_all_rules_and_need_no_registration():
     cage = extraordinary(4)
     samples = LimitSurface(cage, Bilinear()).evaluate(0, [[0.25, 0.5]])
     a, b, c, d = cage.positions[cage.face_vertices[:4]]

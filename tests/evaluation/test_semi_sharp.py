@@ -54,7 +54,7 @@ def test_holes_shape_the_surface_but_are_not_part_of_it():
     assert_part(pierced, LimitSurface(cage).tessellate(3), set(range(9)) - {0, 4})
 
 
-def test_boundary_none_leaves_the_faces_that_do_not_touch_it():
+def test_boundary_none_keeps_only_faces_away_from_the_boundary():
     cage = bumpy(sheet(4, 4))
     inner = LimitSurface(tagged(cage, boundary="none")).tessellate(2)
     assert_part(inner, LimitSurface(cage).tessellate(2), {5, 6, 9, 10})
@@ -79,7 +79,7 @@ class RolledFaces(CatmullClark):
         return [(domain, (part + 4) % refined.half_edge_count) for domain, part in parts]
 
 
-def test_the_order_in_which_a_scheme_numbers_faces_does_not_matter(np_rng):
+def test_results_do_not_depend_on_a_schemes_numbering_of_faces(np_rng):
     creases = np.column_stack([cube().edges, np.linspace(4, 4.9, 12)])
     cage = bumpy(tagged(cube(), creases=creases, crease_method="chaikin"))
     scheme = RolledFaces()

@@ -108,7 +108,7 @@ def test_a_sample_offset_moves_extraordinary_vertices_only():
     np.testing.assert_array_equal(np.flatnonzero(moved), np.flatnonzero(surface.cage.topology.vertex_face_count != 4))
 
 
-def test_the_scheme_that_a_cage_asks_for_is_the_default_and_unknown_ones_are_errors():
+def test_the_cages_scheme_is_the_default_and_unknown_schemes_are_errors():
     faces = tetrahedron().face_vertices.reshape(-1, 3)
     cage = ControlCage(tetrahedron().positions, faces, scheme="loop")
     assert LimitSurface(cage).scheme.name == "loop"

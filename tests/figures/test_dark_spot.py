@@ -55,7 +55,7 @@ def test_stam_darkens_the_disc_and_the_stabilised_form_does_not(valence, variant
         assert abs(result - expected) < SIGMAS * np.hypot(error, its_error) + INTERPOLATION * expected
 
 
-def test_the_artefact_comes_from_the_offset_of_the_cage_and_one_rule_of_three_has_it():
+def test_only_stam_with_an_offset_cage_has_the_artefact():
     for (scheme, valence), (offset, _) in ROWS.items():
         surface = surface_of(scheme, valence)
         limit = surface.evaluate(0, [[0.0, 0.0]]).p[0]
@@ -121,7 +121,7 @@ def test_turned_at_random_the_stabilised_form_has_the_errors_of_single_precision
     assert error == errors[-1]
 
 
-def test_the_limit_normal_is_reached_as_the_eigenvalues_say():
+def test_normals_converge_at_the_rate_of_the_eigenvalues():
     error = normal_errors(*cage_and_normals(3, 0), "limit", np.float64)
     slope = np.diff(np.log(error[10:30])).mean()
     # lambda_4 / lambda_2 at valence 3.

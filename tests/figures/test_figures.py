@@ -100,7 +100,7 @@ RENDERED_TWICE, WRITTEN_TWICE = "shading", "refinement"
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse")
 @pytest.mark.parametrize("name", FIGURES)
-def test_a_figure_draws_without_warnings_fit_for_print(name, options):
+def test_figures_are_drawn_without_warnings_and_fit_for_print(name, options):
     """In a column, where its PDF has text of 6 points, embedded fonts and the pixels that were rendered."""
     figure = FIGURES[name]
 
@@ -139,7 +139,7 @@ def users_cage(tmp_path):
     return tmp_path / "own.obj"
 
 
-def test_cages_around_a_vertex_have_it_first_and_where_it_is_asked_for(users_cage):
+def test_cages_around_a_vertex_have_it_first_and_at_the_given_place(users_cage):
     ((name, cage),) = around_vertices(users_cage, 3).items()
     assert (name, cage.topology.vertex_face_count[0]) == ("valence 3", 3)
     assert cage.face_vertices.reshape(-1, 4)[:3, 0].tolist() == [0] * 3
@@ -190,7 +190,7 @@ def test_figures_take_cages_of_users(name, options, users_cage):
     assert path.read_bytes() != first
 
 
-def test_files_say_what_drew_them_from_which_cage(variant_llvm_ad_rgb, coarse, options, users_cage, monkeypatch):  # noqa: ARG001
+def test_figures_contain_version_command_and_cage(variant_llvm_ad_rgb, coarse, options, users_cage, monkeypatch):  # noqa: ARG001
     pypdf = pytest.importorskip("pypdf")
     monkeypatch.chdir(users_cage.parent)
     paths = FIGURES["subdivision"](options(cage=Path("own.obj"), width=COLUMN))
@@ -244,7 +244,7 @@ def test_a_cage_causes_its_warning_once(options, tmp_path):
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
-def test_cages_that_do_not_fit_a_figure_are_told(options, tmp_path):
+def test_unsuitable_cages_for_figures_are_errors(options, tmp_path):
     torus(5, 4).save(tmp_path / "torus.obj")
     for name, message in (("error", "no extraordinary vertex"), ("creases", "no creases")):
         with pytest.raises(FigureError, match=f'torus.obj" has {message}'):
@@ -303,7 +303,7 @@ def answering(tmp_path):
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse", "no_programs")
-def test_other_programs_are_drawn_only_where_they_are_and_told_of(options, capsys):
+def test_missing_programs_are_omitted_from_figures_with_a_message(options, capsys):
     for name, pictures in (("zebra", (2, 1)), ("zoom", (4, 2))):
         (path,) = FIGURES[name](options(formats=("exr",)))
         height, width = read_channels(path)[0]["R"].shape

@@ -33,7 +33,7 @@ def test_a_new_format_is_a_module_and_a_line(monkeypatch, tmp_path):
         LimitSurface(cube()).tessellate(2).save(tmp_path / "triangles.npz")
 
 
-def test_neither_cages_nor_files_are_imported_with_the_package_and_libraries_only_where_they_are_used(tmp_path):
+def test_cages_files_and_libraries_are_imported_on_use_only(tmp_path):
     """After each of several lines in a new process: modules of cages, of files and of their formats."""
     cube().save(tmp_path / "cube.obj")
     packages = ("mitsuba_subdivision.cage", "mitsuba_subdivision.files", "pxr", "plyfile")
@@ -54,7 +54,7 @@ def skip_without_package(suffix):
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
-def test_files_that_are_not_there_folders_and_circles_of_links_are_named(suffix, tmp_path):
+def test_missing_files_folders_and_link_cycles_are_named(suffix, tmp_path):
     skip_without_package(suffix)
     with pytest.raises(FileNotFoundError, match=rf"missing\{suffix}"):
         ControlCage.from_file(tmp_path / f"missing{suffix}")
@@ -200,7 +200,7 @@ OTHER_FILES = {
 
 
 @pytest.mark.parametrize(("content", "what"), OTHER_FILES.values(), ids=OTHER_FILES)
-def test_an_obj_file_that_is_something_else_is_called_that(content, what, tmp_path):
+def test_errors_of_obj_files_name_the_true_format(content, what, tmp_path):
     path = tmp_path / "cage.obj"
     path.write_bytes(content)
     with pytest.raises(CageError, match=what):

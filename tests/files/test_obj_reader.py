@@ -191,7 +191,7 @@ LEFT_OUT = [
 
 
 @pytest.mark.parametrize(("text", "message"), LEFT_OUT)
-def test_colours_and_texture_coordinates_of_some_corners_are_left_out_with_a_warning(obj_file, text, message):
+def test_colours_and_texture_coordinates_of_some_corners_only_are_omitted_with_a_warning(obj_file, text, message):
     with pytest.warns(CageWarning, match=message):
         cage = ControlCage.from_file(obj_file(text))
     assert cage.texcoords is None
@@ -382,7 +382,7 @@ def test_time_of_tags_grows_with_their_number(tmp_path):
     assert times[1] < 500 * times[0]
 
 
-def test_a_rule_that_no_tag_stands_for_is_lost_with_a_warning(tmp_path, monkeypatch):
+def test_rules_without_a_tag_are_lost_with_a_warning(tmp_path, monkeypatch):
     """As a new boundary rule would be, which OpenSubdiv's tags do not know."""
     monkeypatch.setitem(contents.RULES, "boundary", (*contents.RULES["boundary"], "new"))
     cage = ControlCage([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2, 3]], boundary="new")

@@ -227,7 +227,7 @@ ERRORS = [
 
 
 @pytest.mark.parametrize(("old", "new", "message"), ERRORS)
-def test_errors_say_what_and_where_in_few_words(read, old, new, message):
+def test_errors_are_short_and_name_the_value_and_place(read, old, new, message):
     assert old in SHEET
     pattern = 'cage.ply".*' + ".*".join(re.escape(part) for part in message.split(".*"))
     with pytest.raises(CageError, match=pattern) as caught:
@@ -237,13 +237,13 @@ def test_errors_say_what_and_where_in_few_words(read, old, new, message):
 
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
 @pytest.mark.parametrize("properties", ["", "property list uchar int a\n", "property float a\nproperty double b\n"])
-def test_counts_that_the_file_cannot_hold_are_errors_at_once(read, form, properties):
+def test_impossible_counts_are_errors_before_reading(read, form, properties):
     text = f"ply\nformat {form} 1.0\nelement junk 3000000000\n{properties}end_header\n0 0\n"
     with pytest.raises(CageError, match=r'cage.ply": 3000000000 rows of junk do not fit into the file'):
         read(text)
 
 
-def test_numbers_that_are_not_finite_are_errors_and_no_warnings(read):
+def test_non_finite_numbers_are_errors_without_warnings(read):
     content = SHEET.replace("ascii", "binary_little_endian").replace("double", "float").encode()
     content = content[: content.index(b"0 0 0\n")] + np.zeros(12, "<f4").tobytes()
     faces = b"\x04" + np.arange(4, dtype="<i4").tobytes() + b"\x03" + np.array([1, 4, 2], "<i4").tobytes()

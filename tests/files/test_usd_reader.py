@@ -53,7 +53,7 @@ def sharp_edges(cage):
     return {tuple(sorted((int(a), int(b)))): sharpness for a, b, sharpness in cage.contents.creases}
 
 
-def test_mesh_without_more(read):
+def test_meshes_need_only_points_and_faces(read):
     cage = read()
     np.testing.assert_array_equal(cage.positions, np.array(POINTS, dtype=np.float32))
     assert (cage.face_sizes.tolist(), cage.face_vertices.tolist()) == ([4, 4], [0, 1, 4, 3, 1, 2, 5, 4])
@@ -232,7 +232,7 @@ def test_meshes_are_read_at_the_first_time_with_points_and_faces(read, points):
 
 
 @pytest.mark.parametrize("scheme", ["none", "bilinear"])
-def test_meshes_that_are_not_to_be_smoothed_are_errors_unless_there_are_others(read, scheme):
+def test_unsmoothed_meshes_are_errors_unless_there_are_others(read, scheme):
     line = f"uniform token subdivisionScheme = '{scheme}'"
     with pytest.raises(CageError, match=f'subdivisionScheme is "{scheme}"; expected catmullClark or loop, or a scheme'):
         read(line)
@@ -348,7 +348,7 @@ LONG_NAMES = [
     ],
     ids=lambda value: str(value)[:60],
 )
-def test_errors_say_what_and_where_in_few_words(read, given, message):
+def test_errors_are_short_and_name_the_value_and_place(read, given, message):
     with pytest.raises(CageError, match=r"cage\.usda\".*" + re.escape(message)) as caught:
         read(**given)
     assert len(str(caught.value)) < 600
@@ -469,7 +469,7 @@ def test_the_surface_of_joined_meshes_is_that_of_each(read_all):
         read_all(STRIP, HOUSE, prim=None)
 
 
-def test_data_that_not_all_meshes_have_is_left_out_with_a_warning(read_all):
+def test_data_missing_in_some_meshes_are_omitted_with_a_warning(read_all):
     other = HOUSE.replace("UVMap", "UVs").replace("texCoord2f", "float2").replace("primvars:w", "primvars:v")
     message = 'cage.usda": texture coordinates, "w", "UVs", "v" left out; expected them in all 2 meshes, with the same'
     with pytest.warns(CageWarning, match=message):
@@ -488,7 +488,7 @@ def test_data_that_not_all_meshes_have_is_left_out_with_a_warning(read_all):
         ("uniform token subdivisionScheme = 'loop'", "scheme", "loop", "catmull_clark", "catmull_clark"),
     ],
 )
-def test_meshes_of_different_rules_are_joined_only_by_a_given_one(read_all, token, name, here, there, override):
+def test_meshes_of_different_rules_are_joined_only_under_a_given_rule(read_all, token, name, here, there, override):
     house = HOUSE.replace("<more>", token)
     with pytest.raises(CageError, match=f'prim /house: {name} is "{here}", but "{there}" in the mesh /sheet; expected'):
         read_all(STRIP, house)
@@ -510,7 +510,7 @@ UNSEEN, FLAT = "they are invisible, guides or proxies", "their subdivisionScheme
         ("uniform token subdivisionScheme = 'none'", FLAT),
     ],
 )
-def test_invisible_and_unsmoothed_meshes_are_left_out_with_a_warning_by_default(read_all, token, reason):
+def test_invisible_and_unsmoothed_meshes_are_omitted_with_a_warning(read_all, token, reason):
     house = HOUSE.replace("<more>", token)
     with pytest.warns(CageWarning, match=f"meshes /house left out, as {reason}; expected"):
         assert read_all(STRIP, house).source.name.endswith("/sheet")
@@ -537,7 +537,7 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(("old", "new", "message"), MISTAKES)
-def test_errors_tell_the_mesh_and_its_own_numbers(read_all, old, new, message):
+def test_errors_name_the_mesh_and_its_own_numbers(read_all, old, new, message):
     assert old in STRIP
     with pytest.raises(CageError, match=message):
         read_all(HOUSE, STRIP.replace(old, new, 1), strict=True)

@@ -88,7 +88,7 @@ def test_collapsing_steps_and_infinite_losses_are_errors(views):
 
 
 @pytest.mark.parametrize("integrator", ["prb", "prb_projective"])
-def test_any_differentiable_integrator_will_do(views, integrator):
+def test_any_differentiable_integrator_can_fit(views, integrator):
     """Without outlines, `prb` knows less, but of the same scene."""
     integrator = {"type": integrator, "max_depth": 2} | ({"sppi": 0} if "_" in integrator else {})
     fit = CageFit(cube(), views, {**SKY, **LIGHT, "integrator": integrator}, learning_rate=0.01)

@@ -66,7 +66,7 @@ def test_an_interrupted_run_leaves_its_last_complete_step(target, tmp_path, monk
     np.testing.assert_array_equal(resumed.control_points, whole.control_points)
 
 
-def test_a_refined_cage_comes_nearer():
+def test_a_refined_cage_fits_better():
     directions = LimitSurface(cube()).sample(400, 2).p
     points = directions * (1 + 0.3 * np.sin(5 * directions[:, :1]))
     fit = PointFit(cube(), points, refine=[3, 6]).run(8)
@@ -75,7 +75,7 @@ def test_a_refined_cage_comes_nearer():
     assert fit.losses[7] < fit.losses[5] / 4 < fit.losses[2] / 16
 
 
-def test_control_points_that_nothing_holds_stay(target):
+def test_unconstrained_control_points_stay(target):
     start = moved(target.cage)
     points = target.sample(4000, 1)
     few = points.p[points.element == 0]
@@ -150,7 +150,7 @@ def test_malformed_meshes_and_normals_to_the_inside_are_refused(target):
         to_mesh(target.cage, positions, [[0, 0, 0]])
 
 
-def test_an_anchor_of_great_weight_holds_every_control_point(target):
+def test_a_strong_anchor_holds_all_control_points(target):
     """Where a regulariser is least, it must not pull: its matrix and its right side have the same factor."""
     start = moved(target.cage)
     fit = PointFit(start, target.sample(300, 1).p, regularizers={"bending": 0, "anchor": 1e9}).run(1)

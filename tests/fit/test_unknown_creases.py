@@ -47,7 +47,7 @@ def test_points_equal_the_refined_tagged_cage(name, method, np_rng):
 
 
 @pytest.mark.core
-def test_creases_begin_as_sharp_as_their_edges_are_in_the_mean_and_no_sharper_than_the_highest():
+def test_creases_start_at_the_mean_sharpness_of_their_edges_below_the_highest():
     cage = named_cages.cube()
     cage = tagged(cage, creases=[(*edge, s) for edge, s in zip(cage.edges, (0.5, 1, 2.5, 10, 0, 2), strict=False)])
     unknown = UnknownCreases(cage, cage.edges[:6], np.arange(6) // 2, HIGHEST, None)

@@ -60,7 +60,7 @@ def test_derivatives_by_size_of_lit_surfaces_are_differences_of_their_pictures(c
 
 @exact
 @pytest.mark.parametrize(("name", "mirror", "flip"), [("bumpy", 1, True), ("open", -1, False), ("creased", -1, True)])
-def test_outlines_are_sampled_at_the_triangle_that_is_seen(name, mirror, flip):
+def test_outlines_are_sampled_on_the_visible_triangle(name, mirror, flip):
     """From the eye, and along any direction: it is the one that rays beside the edge meet first."""
     to_world = mi.ScalarTransform4f().scale([mirror, 1, 1])
     placed = {"flip_normals": flip, "to_world": to_world, "shading": "exact"}
@@ -109,7 +109,7 @@ def test_outlines_are_moved_as_much_forward_and_by_placing_and_with_the_same_fac
     np.testing.assert_allclose(by_size, expected, rtol=SUMS)
 
 
-def test_emitters_with_interpolated_normals_have_the_bias_that_the_triangles_have_as_a_ply(tmp_path):
+def test_emitters_with_interpolated_normals_have_the_bias_of_a_ply_mesh(tmp_path):
     """They are black where these normals face away, and the edges of what is black are no edges of triangles."""
     surface = SURFACES["concave, catmull_clark"]()
     positions, made = surface.cage.positions, surface.tessellate(RATE)

@@ -45,7 +45,7 @@ def test_derivatives_inside_an_outline_are_differences(material, shading, both_m
         np.testing.assert_allclose(pictures.forward().values, derivative.values, rtol=SINGLE)
 
 
-def test_interpolated_normals_have_the_gradients_that_the_triangles_have_as_a_ply(tmp_path):
+def test_interpolated_normals_have_the_gradients_of_a_ply_mesh(tmp_path):
     """Which leave out how triangles move the edges of their own shadows, as the differences show."""
     ours = moving("diffuse", "vertex", "around", SAMPLES_OF_SHADOWS)
     surface = LimitSurface(textured_cube())

@@ -28,7 +28,7 @@ def test_only_zero_has_no_unit_vector(variant_llvm_ad_rgb, np_rng):  # noqa: ARG
 # Sizes that packets divide and that they do not.
 @pytest.mark.core
 @pytest.mark.parametrize("size", [3, 4, 12, 16, 28, 48])
-def test_a_row_is_where_it_was_written_and_derivatives_return_to_it(size, variants_all_ad_rgb, np_rng):  # noqa: ARG001
+def test_rows_keep_their_places_and_receive_their_derivatives(size, variants_all_ad_rgb, np_rng):  # noqa: ARG001
     types = ArrayTypes(mi.Float)
     rows = np.arange(ROW_COUNT * size, dtype=np.float64).reshape(ROW_COUNT, size) + 1
     buffer = types.floats(rows)

@@ -60,7 +60,7 @@ def met_past_a_border(kernel, surface, beyond, turns=0):
 @pytest.mark.core
 @pytest.mark.parametrize("variant", [DOUBLE, SINGLE])
 @pytest.mark.parametrize("beyond", [1e-5, 1e-3, 1e-2, 5e-2, 1.0])
-def test_lines_past_a_border_lead_to_the_same_place_of_it_seen_from_any_corner(variant, beyond):
+def test_lines_past_a_border_end_at_the_same_point_from_any_corner(variant, beyond):
     surface, kernel = surface_named("sheet without corners"), kernel_named("sheet without corners", variant)
     p, location, kind, values = met_past_a_border(kernel, surface, beyond)
     assert (np.array(kind) == ON_NORMAL).all()
@@ -134,7 +134,7 @@ def test_rays_from_far_away_hit_as_exactly_as_from_nearby():
 
 @pytest.mark.core
 @pytest.mark.parametrize("rounds", [1, 2, 3])
-def test_locations_are_where_the_points_lie_however_few_rounds_there_are(monkeypatch, np_rng, rounds):
+def test_locations_match_points_for_any_number_of_rounds(monkeypatch, np_rng, rounds):
     surface, kernel = surface_named("mixed torus"), kernel_named("mixed torus", DOUBLE)
     types = kernel.types
     monkeypatch.setattr(line_intersection, "ROUNDS", rounds)

@@ -61,7 +61,7 @@ def every_side(surface, rng):
 
 
 @pytest.mark.parametrize("name", SURFACES)
-def test_both_sides_of_an_edge_are_the_same_points_and_lead_back_or_to_the_border(name, np_rng):
+def test_moves_across_an_edge_keep_points_and_are_reversible_or_end_at_the_border(name, np_rng):
     """Beyond an edge by as much as inside of it: reflected there, it leads back to the reflected place here."""
     surface, kernel = kernel_of(name)
     domain, elements, seen = surface.scheme.domain, surface.patches.elements, 0
@@ -135,7 +135,7 @@ def test_corners_of_triangles_are_vertices(name, rate):
 
 @pytest.mark.parametrize("name", TRIANGULATED)
 @pytest.mark.parametrize("rate", [2, 5])
-def test_triangles_that_share_an_edge_have_its_points_in_common(name, rate, np_rng):
+def test_neighbouring_triangles_share_the_points_of_their_edge(name, rate, np_rng):
     """Within an element and across: those on either side of a crease have vertices of their own."""
     (surface, kernel), table, locations = triangles_of(name, rate)
     types, triangles = kernel.types, table.triangles.astype(np.int64)

@@ -263,7 +263,7 @@ def test_derivatives_are_differences_and_the_same_both_ways(kind, name, order, n
         np.testing.assert_allclose(derivative[kept], difference[kept], rtol, atol, err_msg=field)
 
 
-def test_placed_normals_turn_as_the_placed_surface_does(np_rng):
+def test_placed_normals_turn_with_the_placed_surface(np_rng):
     kernel, matrix = kernel_named("mixed torus", DOUBLE), np.eye(4)
     matrix[:3] = np_rng.normal(size=(3, 4))
     to_world = AffineMap.of(kernel.types.matrix4(matrix.tolist()))

@@ -30,7 +30,7 @@ def rules(cage, vertex):
     return [VertexRule(int(rule)) for rule in cut.topology.vertex_rules[cut.vertex == vertex]]
 
 
-def test_manifold_cages_warn_of_nothing():
+def test_manifold_cages_do_not_warn():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for cage in (cube(), tetrahedron(), torus(5, 4), fan(5), strip(2)):
@@ -47,7 +47,7 @@ def test_pages_run_along_their_spine_and_its_ends_and_where_a_crease_meets_it_ar
 
 
 @pytest.mark.parametrize("spokes", [[], [1], [2], [11], [13], [1, 3], [3, 5], [11, 13, 1], [12, 3]], ids=str)
-def test_fans_that_share_a_vertex_are_apart(spokes):
+def test_fans_that_share_a_vertex_are_separate(spokes):
     cage = joined(fan(5), fan(6), {0: 0}, creases=[(0, spoke, 10) for spoke in spokes])
     cut = cage.cut_mesh.topology
     assert set(rules(cage, 0)) == {VertexRule.CORNER}
@@ -126,7 +126,7 @@ def test_a_face_beside_a_pole_is_turned(collapsed):
     assert np.array_equal(turned.face_vertices, np.concatenate(faces))
 
 
-def test_faces_that_cannot_agree_have_sharp_edges_between_them_and_others_beside_them_are_turned():
+def test_only_faces_that_can_agree_are_turned_and_edges_between_the_others_are_sharp():
     cage, beside = strip(1), joined(strip(1), sheet(6, 6), {0: 2, 1: 4})
     assert np.array_equal(np.flatnonzero(cage.non_manifold.is_vertex), [0, 1])
     faces = [face[:: -1 if f == 27 else 1] for f, face in enumerate(polygons(beside.topology))]
@@ -134,14 +134,14 @@ def test_faces_that_cannot_agree_have_sharp_edges_between_them_and_others_beside
         assert twisted.non_manifold.is_edge.sum() == 2
 
 
-def test_fans_beside_a_spine_hold_it():
+def test_fans_beside_a_spine_are_corners():
     # A closed fan, and a page that comes back to its own side of the spine.
     coming_back = [*polygons(book(3).topology), [1, 2, 28, 29], [2, 1, 30, 31], [1, 29, 28, 30]]
     for cage in (joined(book(3), fan(5), {0: 1}), cage_of(coming_back)):
         assert set(rules(cage, 1)) == {VertexRule.CORNER}
 
 
-def test_thousands_of_fans_are_not_held_against_each_other():
+def test_thousands_of_fans_are_not_compared_pairwise():
     """Semi-sharp edges of one fan do not matter to the copies of the vertex that the others have: these are corners."""
     ring = np.arange(1, 18_001).reshape(-1, 6)
     faces = np.concatenate([np.c_[0 * ring[:, 0], ring[:, [i, i + 1, (i + 2) % 6]]] for i in (0, 2, 4)])

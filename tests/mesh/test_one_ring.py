@@ -88,7 +88,7 @@ def test_gathered_ring_is_a_map_of_meshes(topology, kind):
 
 @by_name(WITH_SHEETS)
 @EVERY_KIND
-def test_many_elements_gather_as_each_alone(topology, kind, monkeypatch):
+def test_many_elements_gather_the_rings_of_single_ones(topology, kind, monkeypatch):
     monkeypatch.setattr(ragged, "CHUNK_LENGTH", 3)
     classes = {}
     for half_edge, signature in enumerate(signatures_at(topology, np.arange(topology.half_edge_count), kind)):

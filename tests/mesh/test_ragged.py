@@ -17,7 +17,7 @@ def test_ragged_arrays_are_the_rows_one_after_the_other(lengths):
     np.testing.assert_array_equal(ragged.ranges(10 * np.arange(len(rows)), counts), flat)
 
 
-def test_offsets_have_the_type_that_is_asked_for():
+def test_offsets_have_the_requested_type():
     assert ragged.offsets([1, 2]).dtype == np.int64
     assert ragged.offsets(np.array([1, 2]), np.int32).dtype == np.int32
     # One number with stride 0, as the sizes of faces that are all alike.
@@ -25,7 +25,7 @@ def test_offsets_have_the_type_that_is_asked_for():
 
 
 @pytest.mark.parametrize("lengths", [[], [5], [1] * 10, [3, 0, 9, 2, 2, 0, 0, 4]])
-def test_runs_cover_all_rows_in_order_and_are_no_longer_than_asked_but_for_one_row(lengths):
+def test_runs_cover_all_rows_in_order_within_the_limit_or_one_row(lengths):
     runs = ragged.runs_of(lengths, 4)
     assert [index for run in runs for index in range(*run.indices(len(lengths)))] == list(range(len(lengths)))
     for run in runs:

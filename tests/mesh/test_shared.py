@@ -66,7 +66,7 @@ def test_making_a_value_may_request_others():
     assert shared_by_key("outer", lambda: shared_by_key("inner", lambda: inner)) is inner
 
 
-def test_arrays_are_the_same_key_if_their_numbers_type_and_shape_are():
+def test_arrays_of_equal_values_type_and_shape_are_equal_keys():
     array = np.arange(6)
     same, copied = Content(array), Content(array.copy())
     assert same == copied

@@ -65,7 +65,7 @@ def along_tangents(points, nearest):
 
 
 @pytest.mark.parametrize("name", [*KINDS, "rook", "hexagon", "loop valence 50"])
-def test_no_point_is_nearer_and_ways_to_them_along_the_normal(name, np_rng):
+def test_no_point_is_nearer_and_vectors_to_nearest_points_are_along_the_normal(name, np_rng):
     surface = surface_named(name)
     segments = max(3, round((SAMPLES / len(grid_locations(surface, 1)[0]) * 4) ** 0.5))
     start, uv = grid_locations(surface, segments)
@@ -128,7 +128,7 @@ def points_of_pieces(pieces, which, uv):
     return np.einsum("sb,sbx->sx", pieces.basis.values(uv), pieces.coefficients[which]) + pieces.origins[which]
 
 
-def test_distances_that_count_as_convex_are_no_more_than_means_in_the_middle(np_rng):
+def test_distances_that_count_as_convex_are_at_most_the_mean_in_the_middle(np_rng):
     """Between random pairs of points in a piece, where its box says that squared distances from a point are convex."""
     pieces, count = surface_named("rook")._surface_pieces.regular, 5000
     which, boxes = np_rng.integers(0, len(pieces), count), TurnedBoxes.around(pieces)
@@ -150,7 +150,7 @@ def test_bounds_around_extraordinary_points_move_with_them():
         np.testing.assert_allclose(one.reach(2), other.reach(2), rtol=1e-9)
 
 
-def test_descents_end_at_local_minima_and_depend_on_neither_the_unit_nor_other_points(np_rng):
+def test_descents_end_at_local_minima_independent_of_the_unit_and_other_points(np_rng):
     """From anywhere in a piece, also where the distance is not convex."""
     cage, count = surface_named("mixed torus").cage, 600
     pieces = LimitSurface(cage)._surface_pieces.regular

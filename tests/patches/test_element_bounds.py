@@ -42,7 +42,7 @@ def test_boxes_contain_the_surface_far_from_the_origin(name, np_rng):
     assert_contained(LimitSurface(cage, surface.scheme), np_rng)
 
 
-def test_a_minimum_inside_an_element_is_met_to_a_256th_of_its_square():
+def test_bounds_of_an_inner_minimum_are_tight_to_a_256th():
     """Over z = (x - 1/16)^2, the minimum is in the middle of the first of eight parts, whose coefficients are
     ab = -1/256 at least, for a part from a to b.
     """

@@ -64,7 +64,7 @@ def test_stiffness_times_control_points_is_the_gradient_of_area(surface, np_rng)
     assert abs((gradient * positions).sum() / 2 - surface.area()) <= QUADRATURE * surface.area()
 
 
-def test_energies_do_not_depend_on_which_control_points_describe_the_surface(surface):
+def test_energies_of_equal_surfaces_are_equal(surface):
     refinement = surface.cage.refinement(surface.scheme.name)
     finer, m = LimitSurface(refinement.cage), refinement.matrix
     for energy, tolerance in (("stiffness", QUADRATURE), ("bending", BENDING)):
@@ -100,7 +100,7 @@ def test_affine_functions_do_not_bend_in_the_plane(scheme, np_rng):
 
 
 @pytest.mark.parametrize("name", ["sheet without corners", "piece, rings and rims"])
-def test_bending_is_finite_where_that_of_the_surface_is_not(name):
+def test_bending_is_finite_where_the_integral_is_infinite(name):
     # Smooth borders with one face at a vertex: curvature grows too fast there to be integrated.
     surface = LimitSurface(SURFACES[name])
     assert np.abs(surface.bending() - surface.bending(ORDER)).max() <= 0.05 * np.abs(surface.bending()).max()

@@ -74,7 +74,7 @@ def test_patches_of_a_class_see_the_same_near_faces_of_large_fans(scheme):
 
 
 @EVERY_SURFACE
-def test_numbering_and_first_corners_do_not_matter_to_the_classes(scheme, name):
+def test_classes_do_not_depend_on_numbering_and_first_corners(scheme, name):
     cage = cage_of(scheme, name)
     rng = np.random.default_rng(8)
     number = rng.permutation(cage.vertex_count)

@@ -62,7 +62,7 @@ def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkey
         assert corners[code // layout.PATCH] == refined.table.topology.face_offsets[half_edge]
 
 
-def test_parts_that_are_divided_alike_share_their_pieces():
+def test_parts_of_equal_division_share_pieces():
     """A semi-sharp crease has thousands of pieces, of few kinds."""
     surface = LimitSurface(tagged(cube(), creases=[(4, 5, 8.0), (5, 7, 8.0), (7, 6, 8.0), (6, 4, 8.0)]))
     elements = patch_trees(surface.scheme, [patch_class.signature for patch_class in surface.patches.classes])
@@ -72,6 +72,6 @@ def test_parts_that_are_divided_alike_share_their_pieces():
     assert sum(len(shared) for shared in {id(shared): shared for shared in pieces}.values()) < 1000
 
 
-def test_a_table_without_creases_has_the_controls_of_the_patches_themselves():
+def test_tables_without_creases_use_the_patches_control_points():
     surface = LimitSurface(extraordinary(5))
     assert np.shares_memory(surface.pieces().controls, surface.patches.controls)

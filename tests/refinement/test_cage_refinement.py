@@ -185,7 +185,7 @@ def test_seams_along_semi_sharp_edges_of_unequal_sharpness_are_kept(mode, np_rng
         assert surface.cage.face_varying == mode
 
 
-def test_corners_that_no_rule_for_seams_gives_are_an_error():
+def test_corners_of_seams_without_a_rule_are_an_error():
     cage = with_islands(fan(6, creases=[(0, 2, 0.5), (0, 5, 2.0)]), [(0, 1), (0, 4)], "corners_plus1")
     # One of several islands at a vertex is a corner in this mode only.
     other = with_islands(fan(6), [(0, 1), (0, 3), (0, 5)], "corners_plus1")
@@ -207,7 +207,7 @@ def test_faces_that_share_two_edges_are_an_error_under_loop():
         SURFACES[NO_CAGE].refined("loop")
 
 
-def test_a_scheme_with_numbers_of_its_own_is_an_error():
+def test_schemes_with_their_own_numbering_are_errors():
     class Renumbered(Loop):
         name = "renumbered"
 
@@ -241,14 +241,14 @@ def test_holes_stay_holes_where_the_boundary_makes_them():
     np.testing.assert_array_equal(refinement.cage.is_hole, cage.is_hole[refinement.element])
 
 
-def test_the_refined_cage_asks_for_the_scheme_that_was_asked_for():
+def test_the_refined_cage_keeps_the_requested_scheme():
     cage = sheet(2, 2, triangles=True)
     assert cage.refined().scheme is None
     assert cage.refined("loop").scheme == "loop"
     assert cage.refined("loop").refined().face_sizes.tolist() == [3] * (16 * cage.face_count)
 
 
-def test_a_refined_cage_gives_no_warning_of_its_own():
+def test_refined_cages_do_not_warn_again():
     with pytest.warns(match="used by no face"):
         cage = ControlCage([*named_cages.cube().positions, [7, 8, 9]], named_cages.cube().face_vertices.reshape(-1, 4))
     # A filter of a mark would not hold against that of the module.

@@ -85,7 +85,7 @@ def test_the_worst_pixel_is_hit_in_both_images_and_names_values_and_surface(refe
     assert f"{reference.pixels[16, 12, 0]:.6g}" in str(result.worst)
 
 
-def test_evidence_is_of_the_scale_that_is_clearest(reference):
+def test_evidence_comes_from_the_clearest_scale(reference):
     """Its smallest probability is the least of all in units of its limit, which depends on the number of tests."""
     for seed in range(20):
         (tile,) = compare(reference, random_image(np.random.default_rng(seed)), tiers=["tile"]).tiers
@@ -110,7 +110,7 @@ def images(first, count, batches, **options):
     return [random_image(np.random.default_rng(seed), batches, **options) for seed in range(first, first + count)]
 
 
-def test_false_alarms_are_as_rare_as_alpha_says(reference):
+def test_the_rate_of_false_alarms_is_alpha(reference):
     """250 images at alpha = 0.2: about 50 may fail, if the corrections are neither missing nor doubled."""
     # Scales overlap, which makes Bonferroni's bound loose.
     assert 15 < failures(((reference, test) for test in images(1000, 250, 4)), 0.2) < 60
@@ -143,7 +143,7 @@ def test_tiles_at_the_edge_end_with_the_picture():
     assert min(min(tile["width"], tile["height"]) for tile in failing) == 2
 
 
-def test_nothing_is_an_alarm_where_the_same_samples_give_the_same_bits(reference, np_rng):
+def test_equal_bits_of_the_same_samples_never_fail(reference, np_rng):
     test = random_image(np_rng, mean=1.5 * truth(), paired=reference.paired)
     result = compare(reference, test)
     assert statuses(result) == {"probe": "pass", "paired": "pass", "tile": "pass"}
@@ -178,7 +178,7 @@ def test_angles_between_normals_are_exact(degrees):
     assert math.isclose(normal_angle(np.array([1.0, 0, 0]), turned), degrees, rel_tol=1e-9)
 
 
-def test_a_change_below_the_floor_is_single_precision(reference, np_rng):
+def test_changes_below_the_floor_are_rounding(reference, np_rng):
     tight = replace(reference, estimate=replace(reference.estimate, variance=0 * reference.estimate.variance))
     nothing = tight.estimate.variance
     for factor, status in ((1 + 5e-4, Status.PASS), (1 + 5e-3, Status.FAIL)):
@@ -188,7 +188,7 @@ def test_a_change_below_the_floor_is_single_precision(reference, np_rng):
         assert compare(tight, test, ["tile"]).status is status
 
 
-def test_more_scenes_ask_for_more_evidence(judged):
+def test_more_scenes_need_more_evidence(judged):
     of_one, of_ten = (judged(["tile"], LIMITS, n).tier("tile").numbers["scales"]["8"]["limit"] for n in (1, 10))
     assert of_one == pytest.approx(1 - (1 - 0.01 / 4) ** (1 / (16 * 3)))
     assert of_ten == pytest.approx(of_one / 10, rel=2e-3)
@@ -261,7 +261,7 @@ def test_normals_at_silhouettes_do_not_count_and_from_the_third_pixel_on_they_do
 
 
 @pytest.mark.parametrize(("other", "what"), [("angle_p999", "maximum"), ("angle_max", "99.9th percentile")])
-def test_the_worst_normal_is_none_at_a_silhouette(judged, other, what):
+def test_the_worst_normal_is_not_at_a_silhouette(judged, other, what):
     normal = probe_with(normal=rotated(20))["probe"].normal
     normal[tuple(np.argwhere(dome().hit)[0])] *= -1
     result = judged(["probe"], LIMITS.with_values({other: 180}), **probe_with(normal=normal))
@@ -280,7 +280,7 @@ def test_the_worst_pixel_belongs_to_a_failure_before_a_warning(reference, judged
     assert is_within(result.worst, 16, 24)
 
 
-def test_paired_differences_fail_and_say_where_but_rounding_passes_unless_bits_are_asked_for(reference, judged):
+def test_paired_differences_fail_with_their_place_and_rounding_passes_unless_bits_must_agree(reference, judged):
     paired = reference.paired.copy()
     paired[7, 9, 2] *= 1.001
     result = judged(paired=paired)
@@ -317,7 +317,7 @@ OTHER = {"environment": {"llvm": "19", "processor": "a"}}
         ({"files": {"scene.xml": "2"}}, 1, {"paired": "pass"}, "changed since the reference was made: scene.xml"),
     ],
 )
-def test_other_samples_ask_the_tile_tier_and_other_files_are_named(reference, judged, change, factor, expected, said):
+def test_other_samples_use_the_tile_tier_and_other_files_are_named(reference, judged, change, factor, expected, said):
     result = judged(["paired"], paired=factor * reference.paired, metadata={**METADATA, **change})
     assert statuses(result) == expected
     assert result.exit_status == (expected == WARNED)
@@ -325,7 +325,7 @@ def test_other_samples_ask_the_tile_tier_and_other_files_are_named(reference, ju
     assert bool(result.undecided()) == (expected in (SKIPPED, WARNED))
 
 
-def test_a_reference_without_a_sampler_proves_nothing_once_the_scene_has_changed(reference, np_rng):
+def test_references_without_a_sampler_prove_nothing_after_a_change(reference, np_rng):
     of_old = {key: value for key, value in METADATA.items() if key not in ("sampler", "sensor")}
     changed = random_image(np_rng, metadata={**METADATA, "files": {"scene.xml": "2"}}, paired=2 * reference.paired)
     result = compare(replace(reference, metadata=of_old), changed, ["paired"])
@@ -378,7 +378,7 @@ def test_each_image_has_its_own_noise(of_reference, of_test):
     assert alarms <= 1
 
 
-def test_alpha_is_compared_and_warned_of_in_one_image_only():
+def test_alpha_is_compared_and_warns_if_one_image_lacks_it():
     plain = Image("plain", truth())
     made = [np.dstack([plain.pixels, np.full((SIZE, SIZE), value)]) for value in (1, 0)]
     opaque, clear = (replace(plain, pixels=pixels, names=("R", "G", "B", "A")) for pixels in made)

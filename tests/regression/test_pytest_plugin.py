@@ -124,7 +124,7 @@ def test_a_difference_fails_with_a_report_and_update_writes_only_differences(wit
     with_reference.runpytest().assert_outcomes(passed=1)
 
 
-def test_results_and_reports_go_where_and_when_they_are_wanted(with_reference):
+def test_options_place_results_and_reports(with_reference):
     with_reference.runpytest("--render-results=elsewhere").assert_outcomes(passed=1)
     assert not (with_reference.path / "elsewhere").exists()
     with_reference.runpytest("--render-results=elsewhere", "--render-report=all").assert_outcomes(passed=1)

@@ -43,7 +43,7 @@ CASES = [*((5, name) for name in DEFECTS), (3, "Stam's form")]
 
 
 @pytest.mark.parametrize(("valence", "name"), CASES, indirect=["valence"])
-def test_defects_are_caught(reference, valence, name):
+def test_defects_fail(reference, valence, name):
     result = compare_scene(reference, DEFECTS[name](valence))
     assert result.status is Status.FAIL
     assert failing(result) == CAUGHT_BY[name], str(result)

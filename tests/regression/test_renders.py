@@ -66,7 +66,7 @@ def test_merging_by_steps_counts_all_batches_and_keeps_the_probe(loaded):
     assert merged.metadata["paired"] == {"seed": 5, "spp": 8}
 
 
-def test_passes_that_do_not_belong_together_are_refused(loaded):
+def test_passes_of_different_images_are_refused(loaded):
     """For other reasons, see `test_command_line`."""
     other = load_scene(SCENE, {"resolution": 16, "rate": 2}, "box")
     with pytest.raises(RegressionError, match="rate is "):
@@ -151,7 +151,7 @@ def test_samples_weigh_alike_in_batches_of_any_size(np_rng):
     assert np.allclose(result, expected, rtol=1e-14)
 
 
-def test_variance_is_that_of_a_sample_and_one_batch_tells_none(np_rng):
+def test_variance_is_per_sample_and_unknown_for_one_batch(np_rng):
     result = estimate(np_rng, 400).variance / (SPREAD * truth()) ** 2
     # 399 degrees of freedom: 7 % a pixel; 3072 of them.
     assert result.mean() == pytest.approx(1, abs=5 * np.sqrt(2 / 399 / result.size))
@@ -187,7 +187,7 @@ for seed in range(3):
 """
 
 
-def test_rendering_works_after_errors_that_are_kept(variant_llvm_ad_rgb):  # noqa: ARG001 - skips where there is no LLVM
+def test_rendering_works_while_errors_are_kept(variant_llvm_ad_rgb):  # noqa: ARG001 - skips where there is no LLVM
     command = [sys.executable, "-c", SCRIPT, str(SCENE)]
     result = subprocess.run(command, check=False, timeout=120, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
@@ -222,7 +222,7 @@ def test_processors_of_one_name_differ_by_model_numbers():
 @pytest.mark.core
 @pytest.mark.parametrize("size", [(1, 1), (64, 64), (512, 512), (1920, 1080), (10000, 10000)])
 @pytest.mark.parametrize("spp", [1, 16, 17, 100, 1000, 16384])
-def test_parts_have_all_samples_and_no_part_is_small_or_much_too_large(size, spp):
+def test_parts_contain_all_samples_and_are_of_similar_size(size, spp):
     parts = parts_of(spp, size)
     assert sum(parts) == spp
     assert max(parts) - min(parts) <= 1

@@ -83,7 +83,7 @@ PANELS = ["Reference", "Test", "Relative difference", "Angle between normals", "
 PANELS += ["Evidence against noise", "FLIP"]
 
 
-def test_the_ends_of_the_scale_are_the_differences_they_say(monkeypatch):
+def test_the_ends_of_the_scale_state_their_differences(monkeypatch):
     """Half of the pixels are brighter, and half are darker, by as much as the scale reaches."""
     grey = np.ones((4, 4, 3))
     change = np.where(np.arange(4)[:, None, None] < 2, -0.1, 0.1)
@@ -126,7 +126,7 @@ def test_alpha_and_layers_have_panels_of_their_names(monkeypatch):
     np.testing.assert_allclose([panels[f"Difference of {name}"].images[0].get_array() for name in ("A", "nn.X")], 0.1)
 
 
-def test_images_that_are_not_finite_have_both_pictures_with_magenta(failed, monkeypatch):
+def test_non_finite_pixels_are_magenta_in_the_report(failed, monkeypatch):
     pixels = failed.test.pixels.copy()
     pixels[2, 2] = np.nan
     panels = drawn(compare(failed.reference, replace(failed.test, pixels=pixels)), monkeypatch)

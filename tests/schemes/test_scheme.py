@@ -25,7 +25,7 @@ def test_a_scheme_with_other_rules_is_a_copy():
         ("loop", "chaikin", "smooth", 'triangle_rule "smooth"'),
     ],
 )
-def test_rules_that_a_scheme_does_not_know_are_refused(scheme, crease_method, triangle_rule, missing):
+def test_unknown_rules_of_a_scheme_are_refused(scheme, crease_method, triangle_rule, missing):
     with pytest.raises(SchemeError, match=f"the scheme {scheme} has no {missing}"):
         with_rules(scheme_named(scheme), crease_method, triangle_rule)
 

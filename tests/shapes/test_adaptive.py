@@ -83,7 +83,7 @@ def test_errors_are_in_the_world_and_pixels_of_displaced_shapes_as_well():
 
 
 @scalar
-def test_an_orthographic_sensor_sees_the_outline_that_one_from_far_away_sees():
+def test_outlines_of_orthographic_and_distant_sensors_agree():
     def seen(fov, distance):
         to_world = looking_at_the_middle(distance * np.array([4.0, -6, 3]))
         return make(chord_error=1e-2, sensor_to_world=to_world, sensor_fov=fov, **FILM, outline="sensor")
@@ -123,7 +123,7 @@ def test_sensors_of_other_kinds_are_refused():
     [({"chord_error": 1e-1}, 21, "21 numbers; expected"), ({}, 24, "expected finite numbers")],
     ids=["chord_error", "None"],
 )
-def test_control_points_that_are_wrong_choose_no_triangles(count, message, limit):
+def test_invalid_control_points_do_not_retessellate(count, message, limit):
     shape = make(cube(), chord_error=1e-2)
     parameters, faces = mi.traverse(shape), buffer(shape, "faces")
     parameters["control_points"] = upload(type(parameters["control_points"]), np.full(count, np.nan))

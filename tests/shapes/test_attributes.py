@@ -15,7 +15,7 @@ from shapes.variants import every_array_variant, every_variant, exact, llvm, sha
 
 
 @llvm
-def test_rendering_takes_the_same_kernels_wherever_arrays_lie():
+def test_kernels_of_renders_do_not_depend_on_alignment():
     """Texture coordinates are read in packets where they are aligned, and one by one where they are not."""
     cage = with_attributes(cube())
     # Shapes that still live are part of kernels, too.

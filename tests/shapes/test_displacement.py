@@ -195,7 +195,7 @@ def test_hits_are_on_the_displaced_surface_with_its_normals_and_derivatives(plai
         pytest.param("creased islands", ADAPTIVE, "vertex_height", "exact", marks=exact),
     ],
 )
-def test_vertices_in_one_place_stay_in_one_place_bit_by_bit(name, triangles, kind, shading):
+def test_coincident_vertices_stay_coincident(name, triangles, kind, shading):
     shape = make(CAGES[name](), heights(kind), shading=shading, **triangles)
     after, _ = vertices(shape)
     update(shape, displacement_scale=[0.0])
@@ -262,7 +262,7 @@ def test_interactions_detached_from_shapes_have_no_derivatives_by_heights():
 
 @exact_llvm
 @pytest.mark.parametrize("refused", ["to_world", "control_points", "cage_height"])
-def test_an_update_that_is_refused_changes_nothing_else_until_it_is_right(refused):
+def test_refused_updates_change_nothing_until_corrected(refused):
     """Rays met another surface than that of the triangles, whose faces and normals were out of step."""
     scene, other = (scene_with(shape=make(CAGES["cube"](), "vertex_height", shading="exact")) for _ in range(2))
     points, along = 2 * cube().positions.ravel(), camera_rays(8)
@@ -400,7 +400,7 @@ def test_height_ranges_cover_textures_and_attributes():
 
 
 @every_variant
-def test_textures_that_are_no_heights_are_refused():
+def test_unsupported_textures_of_heights_are_refused():
     with pytest.raises(ValueError, match=r'kind "MeshAttribute" was given; expected the name of the attribute itself'):
         heights_of({"type": "mesh_attribute", "name": "vertex_height"})
 

@@ -138,7 +138,7 @@ PLAIN, AWAY, SEEN = ((cage, {"tessellation_rate": 2}) for cage in (CAGE, FAR, TE
     ],
 )
 @every_variant
-def test_an_update_that_is_refused_changes_nothing(made, name, value, message):
+def test_refused_updates_change_nothing(made, name, value, message):
     cage, parameters = made
     shape = load(cage, **parameters)
     shown = mi.traverse(shape)

@@ -165,7 +165,7 @@ def test_hits_lie_on_the_limit_surface(name, matrix, flips, np_rng):
         assert np.quantile(off, 0.95 if scheme == "doo_sabin" else 1) < tolerance * rounding
 
 
-def test_rays_through_folds_are_led_no_farther_than_triangles_are_large_and_as_their_mirror_images(np_rng):
+def test_rays_through_folds_move_less_than_a_triangle_and_symmetrically(np_rng):
     """Else one that passes an edge of a coarse triangle would be led to another part of the surface."""
     cage = ControlCage.from_file(example_file("cages/propeller.obj"))
     low, high = cage.positions.min(axis=0), cage.positions.max(axis=0)
@@ -344,7 +344,7 @@ def test_light_passes_through():
 
 
 # Instances are in test_interaction_hook.py.
-def test_merged_shapes_are_met_as_others():
+def test_merged_shapes_are_hit_like_others():
     to_world = mi.ScalarTransform4f().translate([1, 2, 3]).rotate([0.6, 0.8, 0], 50).scale([1, 0.6, 1.4])
     along = camera_rays(RESOLUTION, origin=(5, -4, 5), target=(1, 2, 3), fov=16)
     placed, aside = (make(cube(), to_world=t) for t in (to_world, mi.ScalarTransform4f().translate([9, 0, 0])))

@@ -152,7 +152,7 @@ def test_errors_keep_no_objects_of_c_and_go_with_their_last_name(monkeypatch):
 
 
 @llvm
-def test_shapes_that_are_made_in_parallel_share_a_hook_and_errors_leave_no_variables_behind():
+def test_shapes_made_in_parallel_share_a_hook_and_errors_leave_no_variables():
     """Mitsuba makes the shapes of a scene in parallel; the table of one hook must not be given up for another's."""
     code = """
 import contextlib
@@ -405,7 +405,7 @@ def test_inactive_lanes_may_have_any_triangle():
 
 
 @every_array_variant
-def test_all_hits_are_counted_for_the_log(monkeypatch):
+def test_the_log_counts_all_hits(monkeypatch):
     """With the level Debug, by where they were found; the shape logs those before the latest."""
     shape = load(sheet(1, 1, boundary="edge_and_corner"), tessellation_rate=1, shading="exact")
     scene, count, logged = scene_with(shape=shape), 5, []
@@ -504,14 +504,14 @@ UNKNOWN = "0 virtual functions {} of the known arguments; expected one"
     ],
 )
 @llvm
-def test_a_class_with_other_functions_is_rejected(monkeypatch, place, value, message):
+def test_classes_with_other_functions_are_rejected(monkeypatch, place, value, message):
     monkeypatch.setattr(f"mitsuba_subdivision.shapes.interaction_hook.{place}", value)
     with pytest.raises(RuntimeError, match=message):
         interaction_hook.InteractionHook(mi.llvm_ad_rgb)
 
 
 @llvm
-def test_the_trial_leaves_nothing_that_scenes_would_call(monkeypatch):
+def test_the_trial_leaves_nothing_for_scenes_to_call(monkeypatch):
     """Symbolic calls are traced for all shapes that exist, also before garbage is collected."""
     make()
     monkeypatch.setattr(interaction_hook.InteractionHook, "_tag_groups", lambda _: None)

@@ -79,7 +79,7 @@ def test_many_shapes_load(count, parallel, kinds):
 
 
 @llvm
-def test_an_error_in_one_of_many_shapes_is_that_of_the_load():
+def test_an_error_of_one_shape_is_raised_by_the_load():
     with pytest.raises(RuntimeError, match='parameter "tessellation_rate" is 0; expected 1 to'):
         loaded_together([*[described(cube())] * SOME, {**described(cube()), "tessellation_rate": 0}])
 
@@ -264,7 +264,7 @@ def cage_of(shape):
 
 
 @every_variant
-def test_a_file_is_read_once_until_it_changes_and_warned_of_by_each_shape(tmp_path, monkeypatch):
+def test_a_file_is_read_once_until_it_changes_and_each_shape_warns(tmp_path, monkeypatch):
     path, unused = tmp_path / "cube.obj", "v 9 9 9\n"
 
     def warned(**options):
@@ -291,7 +291,7 @@ def test_only_usd_files_refer_to_other_files():
 
 
 @llvm
-def test_triangles_that_are_chosen_anew_keep_derivatives():
+def test_retessellation_keeps_derivatives():
     shape = load(cube())
     dr.enable_grad(mi.traverse(shape)["control_points"])
     shape.retessellate()

@@ -160,7 +160,7 @@ def test_methods_agree_with_a_mesh_of_the_same_triangles(shading, tmp_path):
 
 
 @exact_llvm
-def test_methods_under_exact_shading_are_of_the_surface_or_refused():
+def test_methods_under_exact_shading_use_the_surface_or_raise():
     shape, surface = made("exact"), LimitSurface(CAGE)
     scene = scene_with(shape=shape)
     si = scene.ray_intersect(mi.Ray3f([0.1, 0.2, 5], [0.01, 0, -1]))
@@ -189,7 +189,7 @@ def test_methods_under_exact_shading_are_of_the_surface_or_refused():
 
 @shadings
 @every_variant
-def test_a_cage_without_texture_coordinates_has_none_to_find(shading):
+def test_errors_name_missing_texture_coordinates_and_normals(shading):
     shape = load(cube(), shading=shading)
     message = ": the mesh has no texture coordinates at its vertices, as the cage has none"
     refused(f"eval_parameterization{message}", shape.eval_parameterization, mi.Point2f(0.5))

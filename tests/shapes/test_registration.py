@@ -48,7 +48,7 @@ def test_every_variant(variants_all):
 
 
 @every_variant
-def test_a_missing_llvm_matters_to_its_own_variants_only(monkeypatch):
+def test_a_missing_llvm_affects_only_llvm_variants(monkeypatch):
     monkeypatch.setattr("mitsuba_subdivision.llvm.llvm_problem", lambda: "no LLVM here")
     require_llvm.cache_clear()
     if mi.variant().startswith("llvm"):
@@ -59,7 +59,7 @@ def test_a_missing_llvm_matters_to_its_own_variants_only(monkeypatch):
 
 
 @needs_llvm
-def test_a_library_that_aborts_is_warned_of_where_an_llvm_variant_is_set_and_nowhere_else(monkeypatch):
+def test_aborting_libraries_warn_only_where_an_llvm_variant_is_set(monkeypatch):
     mi.set_variant("scalar_rgb")
     monkeypatch.setattr("mitsuba_subdivision.llvm.llvm_problem", lambda: "this LLVM aborts")
     with pytest.warns(RuntimeWarning, match="this LLVM aborts"):
@@ -148,14 +148,14 @@ def test_flat_faces_contradict_exact_shading():
 
 
 @scalar
-def test_scalar_variants_have_a_reason_of_their_own_not_to_have_exact_shading():
+def test_the_error_of_exact_shading_in_scalar_variants_names_the_variant():
     assert problem() == "exact shading needs a variant of llvm or cuda"
     with pytest.raises(Exception, match='shading: "exact" in a scalar variant; expected "vertex", "auto"'):
         load(cube(), shading="exact")
 
 
 @llvm
-def test_without_the_hook_automatic_shading_is_by_normals_of_vertices(monkeypatch):
+def test_without_the_hook_automatic_shading_uses_vertex_normals(monkeypatch):
     monkeypatch.setattr(interaction_hook, "hook_problem", lambda: "needs another computer")
     assert problem() == "exact shading needs another computer"
     automatic = load(cube(), shading="auto")

@@ -241,7 +241,7 @@ def placed(cage, to_world, **options):
 
 @pytest.mark.parametrize("how", ["to_world", "cage", "cage, and back", "cage, turned"])
 @every_variant
-def test_a_far_place_costs_normals_nothing_and_points_no_more_than_a_ply_loses(tmp_path, how):
+def test_far_from_the_origin_normals_stay_exact_and_points_lose_no_more_than_in_a_ply(tmp_path, how):
     cage = named_cages.extraordinary(5)
     there, back = (mi.ScalarTransform4f().translate((sign * SHIFT).tolist()) for sign in (1, -1))
     moved = cage.with_positions(cage.positions + SHIFT)
@@ -313,7 +313,7 @@ def test_other_evaluators_are_placed_as_well():
 
 
 @every_variant
-def test_to_world_is_of_the_type_that_mitsubas_shapes_have():
+def test_to_world_has_the_type_of_mitsubas_shapes():
     shown, expected = mi.traverse(make()), mi.traverse(mi.load_dict({"type": "rectangle"}))
     assert type(shown["to_world"]) is type(expected["to_world"])
     assert shown.flags("to_world") == expected.flags("to_world")

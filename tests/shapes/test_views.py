@@ -74,7 +74,7 @@ ONCE, KEPT = ("once",), ("once", True)
         pytest.param("direct", "exact", [ONCE], marks=exact),
     ],
 )
-def test_each_view_has_its_gradients_however_they_are_asked_for(integrator, shading, cases):
+def test_each_view_has_the_same_gradients_by_any_call(integrator, shading, cases):
     to_world = mi.ScalarTransform4f().translate([0.1, 0, 0])
     scene = views_of(integrator, shading=shading, to_world=to_world)
     expected = gradient_by(scene, "updates")
@@ -150,7 +150,7 @@ def test_assigned_vertices_stay_when_gradients_pass():
         (SCALE, texels, "control_points, to_world or heights"),
     ],
 )
-def test_gradients_that_end_at_the_shape_warn(name, displacement, told):
+def test_lost_gradients_warn(name, displacement, told):
     key, heights = f"shape.{name}", {"displacement": displacement()} if displacement else {}
     scene = views_of("prb", COLOURED, **COLOUR, **heights)
     parameters, size = mi.traverse(scene), dr.opaque(mi.Float, 1)

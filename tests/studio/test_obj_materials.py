@@ -58,7 +58,7 @@ def test_each_material_is_a_shape_with_its_bsdf(file):
     assert np.isfinite(np.array(mi.render(mi.load_dict(scene), spp=1))).all()
 
 
-def test_materials_that_no_library_has_are_grey_and_told(file):
+def test_unknown_materials_are_grey_and_warn(file):
     (file.parent / "cube.mtl").write_text("newmtl red\nKd 1 0 0\n")
     with pytest.warns(CageWarning, match='cube.obj": no material library has "lamp"; their faces are grey'):
         assert studio_scene(file, **SMALL)["surface_2"]["material"] == "lamp"
@@ -124,14 +124,14 @@ def test_options_of_maps(texture, statement, expected):
     np.testing.assert_allclose(at(picture, *places), expected, atol=1e-3)
 
 
-def test_pixels_are_blended_unless_that_is_off(texture):
+def test_pixels_are_interpolated_by_default(texture):
     between = [0.45, 0.75]
     assert at(texture(f"map_Kd {NAME}"), between) == pytest.approx([0.6], abs=1e-3)
     for off in ("-blendu off", "-blendu off -blendv on", "-blendv off"):
         assert at(texture(f"map_Kd {off} {NAME}"), between) == pytest.approx([1], abs=1e-3)
 
 
-def test_options_without_meaning_here_are_told(texture):
+def test_ignored_options_of_maps_warn(texture):
     with pytest.warns(CageWarning, match='a.mtl": "-t 1 2" of map_Kd, "-imfchan r" of map_Kd left out; expected Kd'):
         picture = texture(f"map_Kd -t 1 2 -imfchan r {NAME}")
     assert picture["filename"].endswith(NAME)

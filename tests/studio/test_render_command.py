@@ -92,7 +92,7 @@ raise SystemExit(main([*words, "a.exr"]) or main([*words, "b.exr", "--passes", "
 
 
 @scalar
-def test_a_turntable_comes_round():
+def test_turntables_are_closed():
     table = Turntable(CageScenes(named_cages.cube(), Look(size=(24, 18), spp=64, rate=4, view="front")), 4)
     np.testing.assert_allclose(table.matrix(5), table.matrix(1), atol=1e-12)
     frames = (loaded for number in (1, 2, 1.5) for loaded in table.frames([number], None))
@@ -101,7 +101,7 @@ def test_a_turntable_comes_round():
     assert np.abs(first - quarter).mean() < 0.5 * np.abs(first - between).mean()
 
 
-def test_frames_that_are_there_are_left_alone(folder, capsys):
+def test_existing_frames_are_kept(folder, capsys):
     pytest.importorskip("imageio")
     words = ["cube.obj", "-o", "spin.gif", "--turntable", "3", *SMALL]
     assert render(*words) == 0
@@ -137,7 +137,7 @@ def moving_cages(folder):
 
 
 @llvm
-def test_frames_are_what_each_file_gives_alone(folder):
+def test_frames_equal_pictures_of_single_files(folder):
     moving_cages(folder)
     look = Look(size=(20, 15), spp=16, rate=2, up="z", cage=True)
     moving = frame_range(folder / "f_%02d.obj", look, range(1, 4))

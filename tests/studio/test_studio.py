@@ -52,7 +52,7 @@ def in_picture(points, origin, axes, size):
     scale=st.floats(1e-4, 1e5),
 )
 @settings(max_examples=60, deadline=None)
-def test_all_points_are_in_the_picture_and_as_large_as_fits(seed, azimuth, elevation, size, scale):
+def test_all_points_are_in_the_picture_and_fill_it(seed, azimuth, elevation, size, scale):
     rng = np.random.default_rng(seed)
     points = scale * (rng.normal(size=(40, 3)) * rng.uniform(0.01, 3, 3) + rng.normal(size=3))
     axes, (origin, _) = camera_axes(azimuth, elevation), framed(points, azimuth, elevation, size)
@@ -194,7 +194,7 @@ def test_cages_in_memory_are_read_back_from_a_saved_scene(tmp_path, cage, suffix
 
 
 @scalar
-def test_what_no_file_can_hold_is_refused_before_anything_is_written(tmp_path, monkeypatch):
+def test_unstorable_cages_are_refused_before_writing(tmp_path, monkeypatch):
     pytest.importorskip("pxr")
     values = msub.Attribute(np.linspace(0.25, 1, 24).reshape(24, 1), "face_varying")
     bad, good = (_with(attributes={name: values}) for name in ("a b", "ab"))
@@ -272,12 +272,12 @@ def test_errors_say_what_was_expected(arguments, message):
     "bounds", [[[0, 0, 0], [0, 0, 0]], [[1, 0, 0], [0, 1, 1]], [[0, 0, 0]], [[0, 0, 0], [1, 1, np.inf]]]
 )
 @scalar
-def test_bounds_that_are_none_are_refused(bounds):
+def test_invalid_bounds_are_refused(bounds):
     with pytest.raises(ValueError, match="bounds"):
         studio(bounds)
 
 
-def test_mitsuba_takes_as_many_samples_as_it_is_given():
+def test_mitsuba_renders_the_given_number_of_samples():
     """It would round other numbers up, and warn."""
     counts = [sampler(spp)["sample_count"] for spp in range(1, 101)]
     assert [mi.load_dict(sampler(spp)).sample_count() for spp in range(1, 101)] == counts
@@ -292,7 +292,7 @@ def coloured(attribute, **more):
 
 
 @scalar
-def test_colours_of_vertices_are_seen_unless_there_is_a_checkerboard(tmp_path):
+def test_vertex_colours_are_shown_without_a_checkerboard(tmp_path):
     """Red is on the right and blue on the left, from a file and from memory."""
     pytest.importorskip("plyfile")
     coloured("color").save(tmp_path / "cube.ply")
@@ -321,7 +321,7 @@ def test_colours_of_vertices_are_seen_unless_there_is_a_checkerboard(tmp_path):
     ],
 )
 @scalar
-def test_a_model_of_a_size_that_cannot_be_rendered_is_told_with_the_name_of_its_file(tmp_path, scale, message):
+def test_unrenderable_sizes_are_errors_that_name_the_file(tmp_path, scale, message):
     cage, is_error = _with(positions=named_cages.cube().positions * scale + (scale == 0)), scale in (0, 1e300)
     cage.save(tmp_path / "cube.obj")
     for model, name in ((cage, ""), (tmp_path / "cube.obj", 'cube.obj": ')):

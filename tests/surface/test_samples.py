@@ -108,7 +108,7 @@ def test_vertices_are_samples_where_they_say(name, monkeypatch):
 # Matrices
 
 
-def test_a_rate_stands_for_its_table():
+def test_a_rate_gives_the_same_as_its_table():
     surface = LimitSurface(mixed_torus())
     points = surface.tessellation_matrix(2).p @ surface.cage.positions
     np.testing.assert_allclose(points, surface.tessellate(2).positions, atol=ROUNDED)
@@ -127,7 +127,7 @@ def test_matrices_are_in_canonical_form_and_sparse():
         surface.matrix(0, [[0.5, 0.5]], derivatives=3)
 
 
-def test_attributes_that_are_subdivided_as_points_are_take_the_same_matrix(np_rng):
+def test_attributes_subdivided_as_points_share_the_matrix(np_rng):
     heat = np_rng.random((mixed_torus().vertex_count, 2))
     surface = LimitSurface(tagged(mixed_torus(), attributes={"heat": Attribute(heat)}))
     samples = surface.sample(300)

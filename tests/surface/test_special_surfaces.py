@@ -11,7 +11,7 @@ from reference.refined_cages import refine_first, tagged
 QUADRATURE, BOXES = 1e-5, 0.03
 
 
-def test_holes_are_no_part():
+def test_holes_have_no_surface():
     whole, holed = LimitSurface(cube()), LimitSurface(tagged(cube(), holes=[1, 2]))
     np.testing.assert_allclose(holed.area(), whole.area() * 4 / 6, rtol=1e-10)
     assert not np.isin([1, 2], holed.sample(1000).element).any()
@@ -33,7 +33,7 @@ def test_a_collapsed_surface_is_a_point():
     assert at_origin.area() == at_origin.stiffness().count_nonzero() == at_origin.bending().count_nonzero() == 0
 
 
-def test_the_unit_of_length_does_not_matter(np_rng):
+def test_results_do_not_depend_on_the_unit_of_length(np_rng):
     """Powers of two scale all products exactly."""
     cage, points = bumpy(mixed_torus()), np_rng.normal(size=(50, 3)) * 3
     here = LimitSurface(cage)
@@ -80,7 +80,7 @@ BLOCKS = {
 
 
 @pytest.mark.parametrize("name", ["mixed torus", "loop corner", "semi-sharp ring"])
-def test_blocks_that_bound_memory_do_not_show(name, np_rng, monkeypatch):
+def test_results_do_not_depend_on_blocks(name, np_rng, monkeypatch):
     named = surface_named(name)
     where, points = random_locations(named, np_rng, 200), np_rng.uniform(-1.5, 3, (50, 3))
     criterion = Criterion("chord", 1e-2 * np.linalg.norm(np.ptp(named.cage.positions, axis=0)))

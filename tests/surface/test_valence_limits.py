@@ -91,7 +91,7 @@ class WholeLoop(Loop):
     [(CatmullClark(), WholeCatmullClark(), 0), (Loop(), WholeLoop(), 0), (Loop(), WholeLoop(), 10)],
     ids=["catmull_clark", "loop", "loop corner"],
 )
-def test_far_faces_of_a_fan_do_not_matter(scheme, whole, corner, np_rng, monkeypatch):
+def test_far_faces_of_a_fan_have_no_effect(scheme, whole, corner, np_rng, monkeypatch):
     """The surface by the near faces is that by all faces of a fan, and that by the rules, level by level."""
     count = NEAR_FACES + 5
     monkeypatch.setattr(arguments, "MOST_DIFFERENT_FACES", count)

@@ -43,14 +43,14 @@ CHECKED += ["valence 2", "loop mixed torus", "loop sheet", "loop corner", "doo_s
 
 
 @pytest.mark.parametrize("name", CHECKED)
-def test_neither_triangles_nor_the_surface_are_further_from_each_other_than_asked(name):
+def test_triangles_and_surface_are_within_the_limit_of_each_other(name):
     surface, error = surface_named(name), 2e-3
     apart = distances(surface, table_of(surface, error, max_rate=256), 1000, 64)
     assert max(apart) <= (error + ROUNDING) * size_of(surface)
 
 
 @pytest.mark.parametrize("name", CHECKED)
-def test_no_edge_is_longer_than_asked(name):
+def test_no_edge_exceeds_the_limit(name):
     surface = surface_named(name)
     table = table_of(surface, 0.05, 256, "edge")
     start, end = table.apply(surface.cage.positions)[0][directed_edges(table.triangles)].swapaxes(0, 1)
@@ -129,7 +129,7 @@ FOLDED = [FLAT, pillow(0), pillow(1e-3), *TRIANGLES]
 
 
 @pytest.mark.parametrize(("surface", "error"), [*((surface, 1e-3) for surface in FOLDED), (FLAT, 1e-2)])
-def test_flat_surfaces_end_where_they_should(surface, error):
+def test_flat_surfaces_end_at_their_border(surface, error):
     """Along open borders and folds: triangles do not stick out, and do not fall short."""
     table, most = table_of(surface, error, max_rate=256), (error + ROUNDING) * size_of(surface)
     # Of two sheets that are one, both are as near: searches take ten times as long.
@@ -190,7 +190,7 @@ def derivatives_of(patches):
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1e-19, 1e-21, 1e-30, 1e-40, 0])
-def test_a_tangent_that_nearly_vanishes_leaves_the_whole_difference_as_the_bound(scale):
+def test_for_nearly_zero_tangents_the_bound_is_the_whole_difference(scale):
     """At a curve in place of a surface, however much of the other tangent rounding leaves; in single precision."""
     u, _ = (BICUBIC.indices / 3).T
     points = np.stack([u, 0 * u, u**3], axis=1)[..., None].astype(np.float32)
@@ -236,7 +236,7 @@ def test_pixels_are_as_small_as_at_the_nearest_point_of_a_box(np_rng):
     np.testing.assert_allclose(Sensor(eye, 1e-3).pixel_size(centre - half, centre + half), expected, rtol=1e-12)
 
 
-def test_only_outlines_are_fine_where_only_they_are_asked_for():
+def test_outline_criteria_refine_outlines_only():
     # As fine as the highest rate allows, without a warning: pictures by default settings ask for outlines of a tenth of
     # a pixel, and for few triangles first.
     TORUS.adaptive_sampling(Criterion("chord", 1e-3, SENSOR, SENSOR), 2)
@@ -319,7 +319,7 @@ def triangles_with_heights(surface, error, extent, heights):
         return len(surface.adaptive_sampling(Criterion("chord", error, **displacement), 64).triangles)
 
 
-def test_a_bump_in_the_middle_of_a_face_is_seen_however_narrow():
+def test_narrow_bumps_inside_faces_are_noticed():
     """The criterion samples heights, also there: a face that is flat elsewhere is divided."""
     plane = ControlCage([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2, 3]], boundary="edge_and_corner")
     surface, bump = LimitSurface(plane), lambda uv: (np.abs(uv - 0.5).max(axis=1) < 1e-3) * 1.0

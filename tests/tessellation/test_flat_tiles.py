@@ -87,7 +87,7 @@ def test_surfaces_are_hardly_smaller_than_their_extents(name, is_convex, np_rng)
 
 
 @pytest.mark.parametrize("unit", [1e-60, 1e60])
-def test_the_unit_and_the_origin_do_not_matter(unit, np_rng):
+def test_results_do_not_depend_on_unit_and_origin(unit, np_rng):
     surface, axes = surface_named("cube"), np_rng.normal(size=(1, 3))
     ((tile, values, samples),) = tiles_of(surface, surface.scheme)
     values += FAR
@@ -119,7 +119,7 @@ class Raised(CatmullClark):
         return refinement._replace(stencils=StencilTable.from_matrix(matrix))
 
 
-def test_a_tile_without_a_normal_is_no_smaller_than_it_is():
+def test_tiles_without_a_normal_are_bounded_by_their_size():
     """Control points on a line: no axis is across the surface, and where rules are not convex they do not bound it."""
     scheme, cage = Raised(), extraordinary(5)
     faces = cage.face_vertices.reshape(-1, 4)

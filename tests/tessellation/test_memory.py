@@ -55,11 +55,11 @@ FIRST_VERSION = {
         ("4:cpu,memory:/a\n3:cpu:/a", FIRST_VERSION, 2050),
     ],
 )
-def test_memory_is_the_least_that_the_machine_and_its_groups_leave(group, files, expected, tmp_path):
+def test_available_memory_is_the_least_of_machine_and_groups(group, files, expected, tmp_path):
     assert available_memory(system(tmp_path, group, **files)) == expected
 
 
-def test_the_process_s_own_limit_counts(tmp_path, monkeypatch):
+def test_the_memory_limit_of_the_process_counts(tmp_path, monkeypatch):
     resource = pytest.importorskip("resource")
     monkeypatch.setattr(resource, "getrlimit", lambda _: (300 * resource.getpagesize(), 0))
     assert available_memory(system(tmp_path, own="200 100 1")) == 100 * resource.getpagesize()
@@ -68,7 +68,7 @@ def test_the_process_s_own_limit_counts(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("cage", "scheme"), [(named_cages.cube(), None), (tetrahedron(), "loop"), (named_cages.extraordinary(7), None)]
 )
-def test_the_rate_that_is_offered_is_the_highest_that_fits(cage, scheme, leave, monkeypatch):
+def test_the_suggested_rate_is_the_highest_possible(cage, scheme, leave, monkeypatch):
     surface = LimitSurface(cage, scheme)
     monkeypatch.setattr("mitsuba_subdivision.tessellation.memory.SMALL", 0)
     leave(MEGABYTE)
@@ -88,7 +88,7 @@ def test_the_rate_that_is_offered_is_the_highest_that_fits(cage, scheme, leave, 
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")
-def test_the_shape_says_so_too(leave):
+def test_the_shape_raises_the_same_error(leave):
     leave(MEGABYTE)
     shape = {"type": "subdivision", **named_cages.cube().as_properties(mi), "tessellation_rate": 300}
     with pytest.raises(RuntimeError, match=r"tessellation rate 300 needs about .* expected at most"):

@@ -32,7 +32,7 @@ def test_few_samples_of_a_part_have_planes_and_many_a_polynomial():
     assert len(others.block) < in_others / 4
 
 
-def test_vertices_of_the_cage_that_no_face_uses_have_none_in_the_tessellation():
+def test_unused_vertices_of_the_cage_are_not_in_the_tessellation():
     cube = named_cages.cube()
     positions = np.insert(cube.positions, [0, 3], 99.0, axis=0)
     faces = np.array([1, 2, 3, 5, 6, 7, 8, 9])[cube.face_vertices].reshape(-1, 4)

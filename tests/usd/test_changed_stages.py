@@ -65,7 +65,7 @@ def test_a_transparent_picture_over_the_background_is_the_picture(tmp_path):
 
 
 @scalar
-def test_a_stronger_layer_changes_what_it_names_and_what_is_not_there_is_told(tmp_path):
+def test_stronger_layers_change_their_prims_and_warn_of_missing_ones(tmp_path):
     path, over = write(tmp_path, STILL + LAMP + DULL_SKY + CAMERA), tmp_path / "look.usda"
     changes = {
         "lamp": 'token visibility = "invisible"',
@@ -112,7 +112,7 @@ def test_an_environment_is_a_dome_in_place_of_all_lights(tmp_path, axis):
 
 
 @scalar
-def test_what_the_studio_adds_is_told_with_the_reason(tmp_path, capfd):
+def test_messages_name_the_studios_additions_and_their_reason(tmp_path, capfd):
     """Lights that are invisible, inactive or without power are none."""
     weak = prim("SphereLight", "weak", "float inputs:intensity = 0")
     hidden, out = (
@@ -135,7 +135,7 @@ def test_what_the_studio_adds_is_told_with_the_reason(tmp_path, capfd):
 
 
 @scalar
-def test_cameras_by_name_intervals_of_shutters_and_frames_without_motion(tmp_path, capfd):
+def test_cameras_have_names_shutters_intervals_and_still_frames_a_message(tmp_path, capfd):
     other = prim("Scope", "rig", prim("Camera", "far", "float focalLength = 10", moved(translate=(0, 0, 50))))
     path = write(tmp_path, STILL + DULL_SKY + CAMERA.replace("1: ", "0: ").replace("5: ", "1: ") + other)
     assert msub.usd_scene(path, mi, camera="far")["sensor"]["fov"] == pytest.approx(92.672, abs=1e-3)
@@ -201,7 +201,7 @@ def test_models_of_a_millimetre_and_of_kilometres_are_the_same_picture(tmp_path)
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
-def test_many_lights_are_chosen_by_what_they_give_and_the_mean_stays(tmp_path):
+def test_light_weights_follow_contributions_and_keep_the_mean(tmp_path):
     def loaded(count):
         powers = [40 if i == 2 else 0.2 for i in range(count)]
         lamps = [

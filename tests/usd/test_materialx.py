@@ -308,7 +308,7 @@ TOLD = [
 
 
 @pytest.mark.parametrize(("text", "message"), TOLD)
-def test_what_cannot_be_had_is_told_once(stage, tmp_path, text, message):
+def test_unsupported_features_warn_once(stage, tmp_path, text, message):
     flat(tmp_path / "black.png", [0] * 3)
     path = stage(text, RED_SQUARE + RED_SQUARE.replace('"square"', '"other"'))
     _, messages = told(StageReader(path).at)
@@ -342,7 +342,7 @@ IGNORED_INPUTS = [
 
 @pytest.mark.parametrize("node", ["ND_image_color3", "ND_tiledimage_color3"])
 @pytest.mark.parametrize(("image", "where", "message"), IGNORED_INPUTS)
-def test_inputs_of_images_and_coordinates_that_are_ignored_are_told_once_by_name(tmp_path, node, image, where, message):
+def test_ignored_inputs_of_images_and_coordinates_warn_once_by_name(tmp_path, node, image, where, message):
     if "tiled" in node and ("address" in image or "layer" in image):
         # It has none of these.
         message = "inputs that ND_tiledimage_color3 does not have are ignored"

@@ -60,7 +60,7 @@ CASES = [
 
 @pytest.mark.core
 @pytest.mark.parametrize(("category", "kind", "inputs", "result"), CASES)
-def test_nodes_are_computed_also_of_pictures_and_whether_or_not_they_stay_pictures(category, kind, inputs, result):
+def test_nodes_of_images_equal_their_operation_per_pixel(category, kind, inputs, result):
     """In place of each input, of colours from -3 to 3 and of one that stands for a file that is not there."""
     np.testing.assert_allclose(node(category, kind, **inputs), result, atol=1e-7)
     random = np.random.default_rng(5)
@@ -185,7 +185,7 @@ def test_pictures_of_one_place_are_joined_there(monkeypatch):
     np.testing.assert_allclose(values, pixels["a.png"] * 0.75 + [0.25, 0, 0], atol=1e-6)
 
 
-def test_what_lies_in_several_places_is_computed_over_the_unit_square(monkeypatch):
+def test_images_at_different_coordinates_are_baked_over_the_unit_square(monkeypatch):
     """A picture of one texel for each quarter, and the same twice as often along u."""
     pixels = {"a.png": np.array([[[1.0], [0.0]], [[0.0], [1.0]]])}
     often = np.diag([2.0, 1.0, 1.0])

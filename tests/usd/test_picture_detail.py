@@ -65,7 +65,7 @@ def _moved(*offset, scale=1.0):
 
 
 @pytest.mark.parametrize(("shading", "columns"), [("exact", 8), ("exact", 60), ("vertex", 8), ("vertex", 20)])
-def test_triangles_are_as_near_as_the_picture_shows_and_not_much_nearer(columns, shading):
+def test_triangles_meet_the_pictures_error_closely(columns, shading):
     cage = torus(columns, columns // 2)
     surface, rate = msub.LimitSurface(cage), _rate(_shape(cage), sensor_at(12.0), shading)
 
@@ -149,7 +149,7 @@ def test_dense_cages_are_framed_by_points_around_the_surface():
         assert 0 <= (points @ unit).max() - (exact @ unit).max() < 0.01
 
 
-def test_equal_cages_are_made_once_and_told_of_by_their_own_names():
+def test_equal_cages_are_made_once_and_warn_by_their_own_names():
     contents = named_cages.cube().contents
     contents = replace(contents, positions=np.concatenate([contents.positions, np.ones((1, 3))]))
     one, other = (replace(contents, source=replace(contents.source, name=name)) for name in ("/left", "/right"))
@@ -224,7 +224,7 @@ def test_the_highest_rate_gives_way_to_memory(monkeypatch, shading):
     assert copied(scene(group=[shape]), rates_of(shape), shading, lowest=3)[1] == {}
 
 
-def test_what_is_too_few_or_too_much_stays_instances_and_much_is_told_with_numbers(monkeypatch):
+def test_few_or_too_large_instances_stay_and_large_ones_warn_with_numbers(monkeypatch):
     shape, notes = cube_shape(), StageWarnings()
     few, contents = (scene(group=[shape], count=count) for count in (LEAST_INSTANCES - 1, COUNT))
     assert copied(few) == (few, {})
@@ -234,7 +234,7 @@ def test_what_is_too_few_or_too_much_stays_instances_and_much_is_told_with_numbe
         notes.warn("stage")
 
 
-def test_copies_that_are_no_instances_are_one_shape_too():
+def test_copies_other_than_instances_are_merged_too():
     """With attributes, which Mitsuba looks up in the wrong place of instances."""
     kinds = {"heat": (8, "vertex"), "paint": (24, "face_varying")}
     attributes = {name: Attribute(np.arange(1.0 * count)[:, None], kind) for name, (count, kind) in kinds.items()}
@@ -258,7 +258,7 @@ def strip(faces):
     return CageContents(points, np.full(faces, 4), corners.ravel(), scheme="catmull_clark")
 
 
-def test_large_copies_are_shapes_of_their_own_that_share_a_cage(monkeypatch):
+def test_large_copies_are_separate_shapes_with_a_shared_cage(monkeypatch):
     shape = ShapeContents("/strip", strip(LARGE), 2 * np.eye(4))
     contents = scene(group=[shape])
     separate = with_large_copies(contents)
@@ -312,7 +312,7 @@ def test_texels_follow_from_pixels(side, uv_side):
     assert needed == {"a.png": pytest.approx(TEXELS_PER_PIXEL * pixels_of_unit() * side / uv_side, rel=ROUNDED)}
 
 
-def test_the_corner_at_which_a_face_begins_does_not_matter():
+def test_results_do_not_depend_on_the_first_corner_of_a_face():
     """Every edge has its own density of texels, the one from the last corner to the first, too."""
     texcoords, shape, needed = Attribute(np.array([[0, 0], [1, 0], [0.8, 0.5], [0, 0.3]]), "vertex"), square(), []
     for turn in range(4):
@@ -329,7 +329,7 @@ def test_the_copy_that_is_largest_in_the_picture_decides():
     assert needed == pytest.approx(TEXELS_PER_PIXEL * pixels_of_unit(DISTANCE / 2), rel=ROUNDED)
 
 
-def test_where_the_detail_is_unknown_nothing_is_reduced():
+def test_images_of_unknown_detail_keep_their_size():
     assert needed_for(square(has_texcoords=False), inputs={"base_color": texture()}) == {"a.png": np.inf}
     texcoord = NodeContents("texcoord", "vector2", {})
     elsewhere = NodeContents("image", "color3", {"file": texture(), "texcoord": texcoord})
@@ -363,7 +363,7 @@ CASES += [((63, 64), [np.inf, 33], (32, 32)), ((64, 64), [np.inf, 64], (64, 64))
 
 
 @pytest.mark.parametrize(("size", "limits", "expected"), CASES)
-def test_images_keep_as_many_pixels_as_are_needed_and_no_more_than_a_limit(size, limits, expected):
+def test_images_keep_the_needed_pixels_up_to_a_limit(size, limits, expected):
     small = reduced(np.full((*size, 3), 200, dtype=np.uint8), *limits, is_srgb=True)
     assert small.shape == (*expected, 3)
     assert (small == 200).all()

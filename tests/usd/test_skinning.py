@@ -133,7 +133,7 @@ def test_instances_with_their_own_animation_have_their_own_points(tmp_path):
     np.testing.assert_allclose(lowest, [0, 7], atol=FLOAT32)
 
 
-def test_joints_that_usd_does_not_evaluate_have_a_warning(tmp_path):
+def test_unsupported_joints_warn(tmp_path):
     path = write(tmp_path, root="Xform")
     with pytest.warns(CageWarning, match="joints and blend shapes are ignored where USD does not evaluate them"):
         StageReader(path).at(5)

@@ -131,7 +131,7 @@ def test_colours_along_curves(tmp_path, interpolation, values, expected, binding
         (("diffuseColor = (1, 0, 0)", "emissiveColor = (1, 0, 0)"), "emission of curves is ignored"),
     ],
 )
-def test_what_curves_of_mitsuba_lack_is_told(tmp_path, change, message):
+def test_unsupported_features_of_curves_warn(tmp_path, change, message):
     text = hair(along("constant", [0.4]), bound()) + material("color3f inputs:diffuseColor = (1, 0, 0)") + camera()
     text += prim("Sphere", "ball")
     _, (warning,) = told(msub.usd_scene, write(tmp_path, text.replace(*change)), mi)

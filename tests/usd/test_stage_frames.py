@@ -168,7 +168,7 @@ def test_turntables_turn_the_stage_before_its_camera(tmp_path, more):
 
 
 @pytest.mark.parametrize("variant", ["scalar_rgb", "llvm_ad_rgb"])
-def test_frames_are_what_each_time_gives_alone(tmp_path, monkeypatch, request, variant):
+def test_frames_equal_pictures_of_single_times(tmp_path, monkeypatch, request, variant):
     """Points, transforms, instances, lights and camera move; weights are made once for each cage."""
     request.getfixturevalue(f"variant_{variant}")
     made = recorded(monkeypatch, scene_entries, "subdivision")
@@ -179,7 +179,7 @@ def test_frames_are_what_each_time_gives_alone(tmp_path, monkeypatch, request, v
 
 
 @scalar
-def test_where_only_the_camera_moves_all_else_is_read_and_loaded_once(tmp_path, monkeypatch):
+def test_a_stage_with_only_a_moving_camera_is_loaded_once(tmp_path, monkeypatch):
     """On a rig, with its focal length and its focus."""
     made = [recorded(monkeypatch, stage_scenes, "scene_entries"), recorded(monkeypatch, _StageWalk, "contents")]
     focus = "float fStop = 5.6\nfloat focusDistance.timeSamples = {1: 9, 5: 14}"
@@ -198,7 +198,7 @@ def test_a_stage_is_still_only_if_nothing_but_cameras_moves(tmp_path, moving):
 
 
 @scalar
-def test_what_changes_from_frame_to_frame_is_shown(tmp_path):
+def test_changes_between_frames_are_shown(tmp_path):
     """Visibility, other faces and other colours; a studio that sees all frames and stands still."""
     faces = FACES.replace("Counts = [4, 4, 4, 4, 4, 4]", "Counts.timeSamples = {1: [4, 4, 4, 4, 4, 4], 3: [4, 4]}")
     faces = faces.replace("Indices = [", "Indices.timeSamples = {1: [").replace("5]", "5], 3: [0,2,3,1, 4,5,7,6]}")
@@ -330,7 +330,7 @@ def stills(*times):
 
 @scalar
 @pytest.mark.filterwarnings("ignore:.*shutters of cameras have no effect")
-def test_textures_are_as_fine_as_the_frame_that_shows_most_of_them_needs(sides):
+def test_textures_are_as_fine_as_the_most_demanding_frame(sides):
     """Alike in all frames, so that nothing changes from one to the next, and no finer than that."""
     first, nearest, last = sides(APPROACH, stills(1, 2, 3))
     assert first <= last < nearest < TEXTURE_SIDE
@@ -352,7 +352,7 @@ def test_textures_are_as_fine_as_the_frame_that_shows_most_of_them_needs(sides):
 
 
 @scalar
-def test_warnings_of_all_frames_are_told_once(tmp_path):
+def test_warnings_of_all_frames_come_once(tmp_path):
     fin = CUBE.replace("4]", "4, 4]", 1).replace("7,5]", "7,5, 0,1,7,6]")
     path = write(tmp_path, prim("Mesh", "fin", fin) + prim("Points", "hair") + LAMP)
     shown, messages = told(lambda: [*frame_range(path, range(1, 3)).frames([1, 2], "box")])

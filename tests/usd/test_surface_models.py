@@ -76,7 +76,7 @@ DIFFUSE = [
 
 
 @pytest.mark.parametrize(("model", "given"), DIFFUSE)
-def test_what_is_diffuse_reflects_its_colour(model, given):
+def test_diffuse_surfaces_reflect_their_colour(model, given):
     for degrees in (0, 60):
         reflected, transmitted = both(model, degrees, **given)
         np.testing.assert_allclose(reflected, [0.1, 0.2, 0.4], rtol=1e-3)
@@ -114,7 +114,7 @@ def test_roughness_beyond_1_is_1():
         np.testing.assert_allclose(of_more, of_1, rtol=SAMPLED)
 
 
-def test_edges_of_metals_have_the_colour_that_the_models_say():
+def test_metal_edges_have_the_models_colour():
     """Gulbrandsen's conductor for Standard Surface; for OpenPBR, a factor of Schlick's reflectance at 82 degrees."""
     edge = [1.0, 0.7, 0.5]
     for degrees in (0.0, 45.0, 75.0):
@@ -130,7 +130,7 @@ def test_edges_of_metals_have_the_colour_that_the_models_say():
 
 
 @pytest.mark.parametrize(("model", "color"), [("UsdPreviewSurface", "diffuseColor"), ("gltf_pbr", "base_color")])
-def test_edges_of_metals_turn_to_white_as_slowly_as_schlick_has_it(model, color):
+def test_metal_edges_approach_white_as_in_schlick(model, color):
     """A conductor of Gulbrandsen's with a white edge is 0.13 too pale at 75 degrees."""
     for degrees in (0, 45, 60, 75, 82):
         expected = np.array(COPPER) + (1 - np.array(COPPER)) * (1 - np.cos(np.radians(degrees))) ** 5
@@ -205,7 +205,7 @@ def test_white_surfaces_nearly_keep_their_light_and_hardly_add_to_it(model, give
         assert 0.8 < total.min() <= total.max() < 1.08, (model, given, degrees, total)
 
 
-def test_models_agree_where_they_mean_the_same():
+def test_equal_materials_of_different_models_agree():
     for model, color, given in (
         ("standard_surface", "base_color", {"specular_IOR": 1.6, "specular_roughness": 0.4}),
         ("open_pbr_surface", "base_color", {"specular_ior": 1.6, "specular_roughness": 0.4}),
@@ -258,7 +258,7 @@ TOLD = [
 
 
 @pytest.mark.parametrize(("model", "given", "message"), TOLD)
-def test_what_cannot_be_had_of_a_material_is_told(model, given, message):
+def test_unsupported_inputs_warn(model, given, message):
     _, notes = entry(look(model, **given))
     assert [message in warning for warning in told(notes.warn, "stage")[1]] == [True] * bool(message)
 
@@ -298,7 +298,7 @@ def test_coats_reflect_as_dielectrics_at_every_angle(degrees):
     np.testing.assert_allclose(reflected, expected, rtol=SAMPLED)
 
 
-def test_bodies_absorb_nothing_without_a_distance_and_all_of_a_colour_that_they_have_none_of():
+def test_bodies_absorb_nothing_without_a_distance_and_all_of_a_missing_channel():
     """By glTF's extension for volumes, the distance is infinite unless it is given."""
     body = {"transmission": 1.0, "thickness": 1.0, "attenuation_color": COLOR}
     assert "depth" not in look("gltf_pbr", **body).inputs
@@ -317,7 +317,7 @@ def test_bodies_absorb_nothing_without_a_distance_and_all_of_a_colour_that_they_
         ("open_pbr_surface", {"geometry_thin_walled": 1.0, "subsurface_weight": 0.5}, 0.25),
     ],
 )
-def test_sheets_let_through_the_part_of_diffuse_light_that_the_model_says(model, given, part):
+def test_sheets_transmit_the_models_share_of_diffuse_light(model, given, part):
     reflected, transmitted = both(model, base_color=[0.8] * 3, subsurface_color=[0.8] * 3, **given)
     np.testing.assert_allclose(transmitted, 0.8 * part, rtol=SAMPLED)
     assert reflected.min() > 0.8 * (1 - part) - SAMPLED
@@ -335,7 +335,7 @@ def test_emission_and_presence():
         assert look("gltf_pbr", alpha=0.4, alpha_mode=mode).inputs.get("opacity") == expected
 
 
-def test_every_input_of_every_model_is_taken_or_told():
+def test_every_input_of_every_model_is_used_or_warns():
     silent = {"subsurface_radius", "subsurface_scale", "subsurface_anisotropy", "subsurface_radius_scale"}
     silent |= {"subsurface_scatter_anisotropy", "occlusion", "tangent", "geometry_tangent", "geometry_coat_tangent"}
     # Of what is left itself.

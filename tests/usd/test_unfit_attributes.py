@@ -123,7 +123,7 @@ UNFIT = [
 
 
 @pytest.mark.parametrize("head", ["", POLYGONS], ids=["smooth", "flat"])
-def test_what_does_not_fit_its_mesh_is_left_out_by_name_and_the_mesh_stays(tmp_path, monkeypatch, head):
+def test_unfitting_data_of_a_mesh_are_omitted_by_name(tmp_path, monkeypatch, head):
     """Each in a mesh of its own, told once; the mesh is what it is without."""
     bodies = [body if "subdivisionScheme" in body else head + body for _, body in UNFIT]
     points, text = scene_of(tmp_path, monkeypatch, [mesh_of(number, body) for number, body in enumerate(bodies)])
@@ -150,7 +150,7 @@ UNUSABLE += [(POINTS, COUNTS, vertices) for vertices in BAD_VERTICES]
 
 
 @pytest.mark.parametrize("head", ["", POLYGONS], ids=["smooth", "flat"])
-def test_a_mesh_whose_points_or_faces_cannot_be_meant_is_left_out_alone(tmp_path, monkeypatch, head):
+def test_only_meshes_with_invalid_points_or_faces_are_omitted(tmp_path, monkeypatch, head):
     color = primvar("displayColor", "color3f", "(0, 1, 0)", "vertex", 8)
     unusable = [mesh_of(number, head + color, faces) for number, faces in enumerate(UNUSABLE)]
     points, text = scene_of(tmp_path, monkeypatch, [*unusable, mesh_of(len(unusable), head)])
@@ -216,7 +216,7 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("text", "expected"), BROKEN)
-def test_a_prim_that_cannot_be_used_is_told_and_the_stage_stays(tmp_path, text, expected):
+def test_unusable_prims_warn_and_the_stage_stays(tmp_path, text, expected):
     entries, messages = told(scene_at, write(tmp_path, mesh_of(0, "") + text))
     mi.load_dict(entries)
     assert "m0" in entries

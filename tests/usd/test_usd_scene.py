@@ -175,7 +175,7 @@ DIFFERENCES = {
 
 
 @pytest.mark.parametrize("difference", DIFFERENCES)
-def test_instances_that_differ_look_like_prims_that_do(scene, difference):
+def test_differing_instances_look_like_differing_prims(scene, difference):
     one, two, above = DIFFERENCES[difference]
     paints = {"red": (1, 0, 0), "blue": (0, 0, 1), "green": (0, 1, 0)}
     text = "".join(material(f"color3f inputs:diffuseColor = {color}", name=name) for name, color in paints.items())
@@ -282,7 +282,7 @@ def test_a_layer_without_a_rate_of_times_is_read(stage, tmp_path):
     np.testing.assert_array_equal(shape.to_world[:3, 3], [0, 0, 3])
 
 
-def test_velocities_of_meshes_are_told_between_samples(stage):
+def test_ignored_velocities_warn_between_samples(stage):
     points, _, faces = CUBE.partition("\n")
     samples = "timeSamples = {{ 1: {0}, 2: {0} }}".format(points.partition(" = ")[2])
     path = stage(mesh("cube", f"point3f[] points.{samples}", faces, f"vector3f[] velocities.{samples}"))
@@ -294,7 +294,7 @@ def test_velocities_of_meshes_are_told_between_samples(stage):
         assert len(messages) == count
 
 
-def test_instances_that_cannot_be_seen_leave_the_others_there(scene):
+def test_invisible_instances_do_not_hide_others(scene):
     """The first one, of size 0, is not what the prototype is read from."""
     cube = mesh("cube", CUBE)
     text = prim("Xform", "class_of", cube).replace("def", "class", 1)
@@ -351,7 +351,7 @@ def test_subsets_share_the_surface_of_the_whole_mesh(stage, monkeypatch, most_fa
     assert ["Principled" in str(part.bsdf()) for part in parts] == [False, True]
 
 
-def test_what_renderers_do_not_show_is_left_and_what_is_not_taken_is_told_once(scene):
+def test_invisible_prims_are_omitted_and_unsupported_ones_warn_once(scene):
     invisible = 'token visibility = "invisible"'
     hidden = {"unseen": invisible, **{name: f'uniform token purpose = "{name}"' for name in ("guide", "proxy")}}
     shown = {"seen": "", "rendered": 'uniform token purpose = "render"\nuniform token model:drawMode = "cards"'}
@@ -390,7 +390,7 @@ def test_a_mesh_that_its_scheme_cannot_subdivide_is_shown_as_polygons(scene, par
     np.testing.assert_array_equal(np.sort(corners.ravel()), [-1] * 12 + [1] * 12)
 
 
-def test_a_cage_is_warned_of_once_by_its_prim(stage):
+def test_warnings_of_a_cage_come_once_and_name_its_prim(stage):
     book = """int[] faceVertexCounts = [4, 4, 4]
         int[] faceVertexIndices = [0, 1, 2, 3, 0, 1, 4, 5, 0, 1, 6, 7]
         point3f[] points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (1, 0, 1), (0, 0, 1), (1, -1, 0), (0, -1, 0)]"""
@@ -399,7 +399,7 @@ def test_a_cage_is_warned_of_once_by_its_prim(stage):
     assert (message.partition(":")[0], loaded is None) == (f'"{path}", prim /book', False)
 
 
-def test_lights_and_cameras_that_cannot_be_used(scene):
+def test_unusable_lights_warn_and_cameras_are_errors(scene):
     cube = mesh("cube", CUBE)
     for bad in ("token inputs:width = 'x'", "float inputs:width = 0", "float inputs:intensity = inf"):
         with pytest.warns(CageWarning, match="prim /lamp: .*; expected .*; the prim is left out"):
@@ -411,7 +411,7 @@ def test_lights_and_cameras_that_cannot_be_used(scene):
         scene(cube + camera(), camera="/none")
 
 
-def test_surfaces_that_emit_light_are_no_lamps(scene):
+def test_glowing_surfaces_do_not_count_as_lamps(scene):
     """A lamp is one of UsdLux, without which there is the studio's."""
     glow = scene(material("color3f inputs:emissiveColor = (1, 2, 3)") + mesh("cube", CUBE, bound()))
     apis = ["MeshLightAPI", "MaterialBindingAPI"]
@@ -536,7 +536,7 @@ def test_colours_of_files_with_primaries_of_their_own_are_converted(tmp_path, pr
     np.testing.assert_allclose(read_texture_image(path, "raw").pixels, colors, atol=1e-6)
 
 
-def test_numbers_come_from_the_channel_that_is_connected(scene, tmp_path):
+def test_numbers_come_from_the_connected_channel(scene, tmp_path):
     """Linear alpha, and a colour's channel as it is decoded."""
     stages.flat(tmp_path / "four.png", [128, 64, 0, 51])
     number = "float inputs:{}.connect = </paint/texture.outputs:{}>\n"
@@ -547,7 +547,7 @@ def test_numbers_come_from_the_channel_that_is_connected(scene, tmp_path):
     np.testing.assert_allclose(roughness, 0.2159, atol=1e-4)
 
 
-def test_textures_have_a_limit_that_can_be_set(scene, tmp_path):
+def test_textures_have_an_adjustable_limit(scene, tmp_path):
     """The square is 32 pixels wide in the picture, so that 64 texels show."""
     stages.flat(tmp_path / "a.png", [128, 128, 128], 256)
     text = CAMERA + material(COLORED, texture("a.png")) + mesh("square", SMOOTH_SQUARE, bound())
@@ -572,7 +572,7 @@ def test_textures_are_freed_without_a_garbage_collection(scene, monkeypatch):
         gc.enable()
 
 
-def test_materials_that_differ_by_their_names_only_are_one(scene):
+def test_materials_with_different_names_only_are_shared(scene):
     paint = material("color3f inputs:diffuseColor = (0.2, 0.4, 0.8)")
     squares = mesh("a", SMOOTH_SQUARE, bound()) + mesh("b", SMOOTH_SQUARE, bound("other"))
     entries = scene(CAMERA + paint + paint.replace("paint", "other") + squares)
@@ -580,7 +580,7 @@ def test_materials_that_differ_by_their_names_only_are_one(scene):
     assert "other" not in entries
 
 
-def test_textures_read_the_coordinates_that_they_name(shown):
+def test_textures_use_the_named_coordinates(shown):
     """Or one texel where these are constant."""
     other = f'texCoord2f[] primvars:other = {[(0.2, 0.2)] * 4} (interpolation = "vertex")'
     picture, messages = told(shown, texture("quadrants.png", name="other"), other, side=8)
@@ -686,7 +686,7 @@ def middle_of_square(scene, lights, height):
 
 
 @pytest.mark.parametrize(("text", "irradiance"), LIGHTS.values(), ids=LIGHTS)
-def test_lights_light_a_plane_as_the_closed_form_says(scene, text, irradiance):
+def test_illuminance_of_a_plane_has_its_closed_form(scene, text, irradiance):
     assert middle_of_square(scene, text, 3) == pytest.approx(0.5 / np.pi * irradiance, rel=0.02)
 
 
@@ -696,7 +696,7 @@ LIGHT_KINDS += [("SphereLight", 1, "point", [0.5]), ("CylinderLight", 0, "cylind
 
 
 @pytest.mark.parametrize(("schema", "is_point", "kind", "size"), LIGHT_KINDS)
-def test_lights_are_as_large_as_usd_says_and_shine_everywhere(stage, scene, schema, is_point, kind, size):
+def test_lights_have_usd_s_size_and_shine_everywhere(stage, scene, schema, is_point, kind, size):
     """Where nothing else is said; spheres are points where the stage says so."""
     usual = "bool inputs:shadow:enable = 1", "float inputs:specular = 1", f"{CONE}180" if "Sphere" in schema else ""
     path = stage(light(schema, f"bool treatAsPoint = {is_point}", *usual, apis=SHAPED))
@@ -743,7 +743,7 @@ def test_lamps_cast_no_shadows(scene, kind, place, integrator, bsdf):
     assert (entries["integrator"]["type"], entries["lamp"].get("bsdf")) == (integrator, bsdf)
 
 
-def test_lights_of_a_studio_are_as_bright_for_a_camera_of_the_stage(scene, variant_llvm_ad_rgb):  # noqa: ARG001
+def test_studio_lights_are_equally_bright_for_a_camera_of_the_stage(scene, variant_llvm_ad_rgb):  # noqa: ARG001
     """There they are far away, where no picture shows them."""
     places = (np.indices((16, 16)).reshape(2, -1) + 0.5) / 16
     middle = dr.zeros(mi.SurfaceInteraction3f)
@@ -839,7 +839,7 @@ def test_render_settings_turn_off_blur(stage, name):
         ("adjustPixelAspectRatio", 6, 3),
     ],
 )
-def test_the_aperture_fits_the_picture_as_render_settings_say(scene, projection, policy, wide, high):
+def test_the_aperture_conforms_by_the_render_settings(scene, projection, policy, wide, high):
     text = settings(RESOLUTION, f'uniform token aspectRatioConformPolicy = "{policy}"')
     text += camera(f'token projection = "{projection}"', aperture=3) + mesh("cube", CUBE)
     entries, messages = told(scene, text, NAMED)
@@ -941,7 +941,7 @@ IGNORED = [
 
 
 @pytest.mark.parametrize(("text", "message", "end"), IGNORED)
-def test_what_is_not_followed_is_told_once_by_name(scene, tmp_path, text, message, end):
+def test_ignored_properties_warn_once_by_name(scene, tmp_path, text, message, end):
     stages.flat(tmp_path / "black.png", [0, 0, 0])
     text += prim("RenderProduct", "product", 'uniform token productType = "deepRaster"') + mesh("square", SQUARE)
     entries, (warning,) = told(scene, text, NAMED if "settings" in text else "")
@@ -951,7 +951,7 @@ def test_what_is_not_followed_is_told_once_by_name(scene, tmp_path, text, messag
 
 
 @pytest.mark.parametrize("head", ["", 'renderSettingsPrimPath = "/none"'])
-def test_render_settings_that_the_stage_does_not_name_are_told(stage, head):
+def test_unreferenced_render_settings_warn(stage, head):
     path = stage(settings(RESOLUTION) + CAMERA + mesh("cube", CUBE), head=head)
     with pytest.warns(CageWarning, match=r"render settings are those that .* all others are ignored \(/settings\)"):
         assert StageReader(path).at().picture.resolution is None
@@ -1006,7 +1006,7 @@ def test_parameters_of_mitsuba_and_a_crop(stage):
     assert msub.usd_scene(path, mi, spp=4)["sensor"]["sampler"]["sample_count"] == 4
 
 
-def test_of_several_cameras_the_first_is_used_and_told(stage):
+def test_the_first_of_several_cameras_is_used_with_a_message(stage):
     first, other, cube = camera(name="a", focal_length=60), camera(name="b"), mesh("cube", CUBE)
     contents, (message,) = told(StageReader(stage(first + other + cube)).at)
     assert "there are several cameras, and the first is used (/a, /b)" in message

@@ -37,18 +37,18 @@ class SceneSource(ABC, Generic[Contents]):
     no file for a frame.
     """
 
-    factor: float | None = None  # By which the scene is larger than the model; None before points are known
+    factor: float | None = None  # Enlargement of the model in the scene; None before points are known
 
     def __init__(
         self,
-        model: object,  # A file; for frames also a name with a number in it, such as "frame_%04d.obj"; or a cage
-        name: str,  # With which messages begin
+        model: object,  # A cage, or a file; for frames also a pattern such as "frame_%04d.obj"
+        name: str,  # Beginning of messages
         look: Look,
         time: float | None,
-        numbers: range | None,  # Times or numbers of files, if there are frames
+        numbers: range | None,  # Times or file numbers of frames, if any
     ) -> None:
         self.name, self.numbers, self._look, self._time, self._path = name, numbers, look, time, Path(str(model))
-        # Types of AOVs by the names of their channels, and names of AOVs by render products.
+        # AOV types by channel names, and AOV names by render products.
         self.aovs, self.products = look.aovs or {}, dict[str, list[str]]()
         self._has_files = numbers is not None and bool(PATTERN.search(self._path.name))
         if numbers is None:
@@ -79,7 +79,7 @@ class SceneSource(ABC, Generic[Contents]):
 
     @abstractmethod
     def points(self, contents: Contents) -> NDArray[np.float64]:
-        """Points ``(n, 3)`` in the world that the studio's camera must see."""
+        """Points ``(n, 3)`` in world space that the studio's camera must see."""
 
     @abstractmethod
     def scene(
@@ -87,8 +87,8 @@ class SceneSource(ABC, Generic[Contents]):
         contents: Contents,
         points: NDArray[np.float64] | None = None,  # (n, 3): of all frames; by default, of the contents
         *,
-        follows_sensor: bool = False,  # Whether triangles may depend on the sensor, as no other one renders the scene
-        turns: Sequence[NDArray[np.float64]] = (),  # (4, 4) each: of that sensor in all pictures, if it moves
+        follows_sensor: bool = False,  # Whether triangles may depend on the sensor, the only one of the scene
+        turns: Sequence[NDArray[np.float64]] = (),  # (4, 4) each: motion of that sensor
     ) -> SceneNode:
         """Entries of a scene."""
 
@@ -99,16 +99,16 @@ class SceneSource(ABC, Generic[Contents]):
         """Loaded scenes of some frames, and of all their sub-frames if there is a shutter."""
 
     def has_studio(self, contents: Contents) -> bool:  # noqa: ARG002 - of cages, always
-        """Whether the camera or the lights are those of the studio, which depend on the points."""
+        """Whether the studio supplies the camera or the lights, which depend on the points."""
         return True
 
     def remarks(self) -> list[str]:
-        """Remarks on the pictures for standard error."""
+        """Lines about the pictures for standard error."""
         return []
 
 
 class StillPicture:
-    """One picture of a source. If only the scene's own sensor renders it, triangles may depend on the sensor."""
+    """One picture of a source. Triangles may depend on the sensor if no other one renders the scene."""
 
     def __init__(self, source: SceneSource[Any], *, follows_sensor: bool = True) -> None:
         self.scene: SceneNode = source.scene(source.at(), follows_sensor=follows_sensor)
@@ -120,9 +120,9 @@ class StillPicture:
 class Turntable:
     """A cage or a stage that turns once, in frames 1 to ``count``, around the middle of its bounds.
 
-    In Mitsuba the model stands still: the camera turns around it the other way, with the lights and the backdrop of the
-    studio. The studio's camera sees the whole model in all frames. Frame 1 is the still picture; in later frames, the
-    model and its own lights are turned counter-clockwise, seen from above.
+    In Mitsuba, the camera turns around the model the other way, with the lights and the backdrop of the studio. The
+    studio's camera sees the whole model in all frames. Frame 1 is the still picture; in later frames, the model and its
+    own lights are turned counter-clockwise, seen from above.
     """
 
     def __init__(self, source: SceneSource[Any], count: int, *, follows_sensor: bool = True) -> None:
@@ -185,7 +185,7 @@ class FrameRange:
 
 
 def load_quietly(scene: SceneNode, filter_name: str | None = None) -> LoadedScene:
-    """Load a scene of cages that have been read before, with their warnings."""
+    """Load a scene without warnings of its cages, which were issued when they were read."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", CageWarning)
         return load_scene(with_meshes(scene), None, filter_name)

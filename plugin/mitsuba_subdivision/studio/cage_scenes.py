@@ -1,4 +1,4 @@
-"""Scenes of one cage in the studio: of a cage in memory or in a file, or of a cage for each frame."""
+"""Scenes of a cage in the studio: from memory, from a file, or from a file for each frame."""
 
 from __future__ import annotations
 
@@ -34,23 +34,24 @@ CHECKER_SQUARES = 16  # Squares along a texture coordinate from 0 to 1
 # Attributes that replace the colour of clay: of PLY files, and of USD's meshes.
 COLOURS = ("color", "displayColor")
 WIRE_COLOUR, WIRE_RATE = (0.015, 0.05, 0.12), 2
-# Radius of the rods, in radii of the model; its maximum, in lengths of the median edge; and radius of balls, in rods.
+# Radius of rods relative to the model's radius, its maximum relative to the median edge, and radius of balls relative
+# to rods.
 ROD, ROD_PER_EDGE, BALL = 0.0045, 0.05, 2.2
-# Radius of the round limit surfaces of square tubes and cubes, in distances of a corner.
+# Radii of the round limit surfaces of square tubes and of cubes, relative to the distance of a corner.
 _TUBE_LIMIT, _CUBE_LIMIT = 2 / 3, 1 / 2
-# Quadrilaterals of a tessellation for a picture of usual size, and its highest rate.
+# Quadrilaterals of a tessellation for a picture of default size, and its highest rate.
 QUADS, HIGHEST_DEFAULT_RATE = 200_000, 24
-# Rate of points that a camera frames, which misses far less than the margin; and faces of cages with a rate of 1.
+# Rate of the points that a camera frames: errors are far below the margin. Larger cages have a rate of 1.
 FRAME_RATE, LARGE = 4, 20_000
 
 
 def frame_table(surface: LimitSurface) -> VertexTable:
-    """Stencils of points all over a limit surface, by which a camera frames it."""
+    """Stencils of points all over a limit surface, for the camera's frame."""
     return surface.sampling(1 if surface.cage.face_count > LARGE else FRAME_RATE)
 
 
 class Model:
-    """A cage, its limit surface, and the rods and balls that draw the cage."""
+    """A cage, its limit surface, and rods and balls that show the cage."""
 
     def __init__(
         self,
@@ -80,7 +81,7 @@ class Model:
 
     @property
     def default_rate(self) -> int:
-        """Segments per edge for a picture of usual size."""
+        """Segments per edge for a picture of default size."""
         return max(2, min(HIGHEST_DEFAULT_RATE, isqrt(QUADS // self.cage.face_count)))
 
     _frame_table = cached_property(lambda self: frame_table(self.surface))
@@ -103,7 +104,7 @@ class Model:
 
     @property
     def wire_cage(self) -> ControlCage:
-        """The cage whose limit surface is rods along the edges and balls around the vertices of the cage."""
+        """A cage whose limit surface consists of rods along the edges and balls around the vertices of the cage."""
         tube = np.array([[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
         cube = named_cages.cube().face_vertices.reshape(6, 4)
         count = len(self.cage.edges)
@@ -112,7 +113,7 @@ class Model:
         return ControlCage(self.wire_points(self.cage.positions), faces, source=CageSource("cage wire"))
 
     def wire_points(self, control_points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Control points of the rods and balls, from the control points ``(n, 3)`` of the cage."""
+        """Control points of the rods and balls for control points ``(n, 3)`` of the cage."""
         ends, radius = control_points[self.cage.edges], self.wire_radius
         along = _unit(ends[:, 1] - ends[:, 0])
         axis = np.eye(3)[np.abs(along).argmin(axis=1)]  # The axis that is furthest from the edge
@@ -125,7 +126,7 @@ class Model:
         return np.concatenate([tubes.reshape(-1, 3), balls.reshape(-1, 3)])
 
     def triangles_for(self, sensor: SceneNode, factor: float = 1.0) -> SceneNode:
-        """Parameters of the coarsest exactly shaded tessellation without visible facets for a sensor."""
+        """Parameters of the coarsest tessellation with exact shading whose facets a sensor does not show."""
         outline, corners = outline_for(sensor), int(self.cage.face_sizes.sum())
         to_world = np.diag([factor, factor, factor, 1.0])[None]
         segments = segments_for(self.cage, to_world, outline, sensor["near_clip"], "exact")
@@ -144,9 +145,9 @@ PosedModel = tuple[Model, NDArray[np.float64]]  # Model and control points (n, 3
 class CageScenes(SceneSource[PosedModel]):
     """Scenes of one cage in the studio.
 
-    Where frames have the same topology, the loaded shape gets other control points, and keeps its patches and weights.
+    In frames of the same topology, the loaded shape keeps its patches and weights, and only control points change.
 
-    Raises CageError, OSError if there is no file of a frame.
+    Raises CageError or OSError if a frame's file cannot be read.
     """
 
     def __init__(
@@ -167,7 +168,7 @@ class CageScenes(SceneSource[PosedModel]):
         self._cage, self._prim, self._scheme = cage, prim, scheme
         self._rules = {"scheme": scheme} if scheme else {}
         self._first: Any = None  # Contents and model of the first frame that is read
-        # Frames whose warnings were printed: all are read once for the camera, and again when they are rendered.
+        # Frames whose warnings were printed: frames are read for the camera and again for the render.
         self._seen: set[int | None] = set()
 
     def at(self, number: int | None = None) -> PosedModel:
@@ -207,9 +208,9 @@ class CageScenes(SceneSource[PosedModel]):
         follows_sensor: bool = False,
         turns: Sequence[NDArray[np.float64]] = (),  # noqa: ARG002
     ) -> SceneNode:
-        """Entries "surface", "cage" if it is drawn, and those of the studio.
+        """Entries "surface", "cage" if it is shown, and those of the studio.
 
-        Raises CageError if ``checker`` is set, and there are no texture coordinates.
+        Raises CageError if ``checker`` is set and there are no texture coordinates.
         """
         look, (model, _) = self._look, contents
         if look.checker and model.cage.texcoords is None:
@@ -331,24 +332,24 @@ def studio_scene(
     spp : int
         Samples per pixel.
     rate : int, optional
-        Segments per edge of the cage. By default as many as a picture needs: with exact shading, adaptive ones that put
-        outlines within a tenth of a pixel as this camera sees them; else fewer for larger cages.
+        Segments per edge of the cage. By default as many as a picture needs: with exact shading, adaptive ones with
+        outlines within a tenth of a pixel for this camera; else fewer for larger cages.
     shading : "auto", "vertex" or "exact"
-        If the first is not exact, a line on standard error says why.
+        If "auto" does not become "exact", a line on standard error says why.
     checker : bool
-        Whether texture coordinates are shown as a checkerboard.
+        Whether a checkerboard shows texture coordinates.
     cage : bool
         Whether the control cage is drawn over the surface.
 
     Returns
     -------
     dict
-        The model is the entry "surface", the drawn cage "cage"; the others are those of the studio.
+        Entries "surface", "cage" if it is drawn, and those of the studio.
 
     Raises
     ------
     CageError, OSError
-        As `ControlCage.from_file` does; or if ``checker`` is set and there are no texture coordinates.
+        As `ControlCage.from_file`; or if ``checker`` is set and there are no texture coordinates.
     ValueError
         If the view, the axis or the size is invalid.
     """

@@ -1,4 +1,4 @@
-"""Materials of OBJ files: the libraries (``.mtl``) that they name, as BSDFs of Mitsuba."""
+"""Material libraries (``.mtl``) of OBJ files as BSDFs of Mitsuba."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ import numpy as np
 from ..cage.errors import shortened, warn
 from ..variants import SceneNode
 
-# Entries of numbers, and how many; the first of "d" and "Tr" in a material counts.
+# Numeric entries and their number of values; the first of "d" and "Tr" in a material counts.
 _NUMBERS = {"Kd": 3, "Ks": 3, "Ke": 3, "Ns": 1, "d": 1, "Tr": 1, "illum": 1, "Pr": 1, "Pm": 1}
 _TEXTURE = "map_Kd"
-# Entries about ambient light, and the index of refraction, in whose place Ks gives the strength of highlights.
+# Ignored entries: ambient light, and the index of refraction, as Ks gives the strength of highlights.
 _WITHOUT_EFFECT = ("Ka", "map_Ka", "Ni")
 _MATTE = (0, 1)  # Models of the entry "illum" without highlights
 
-# Options of a map, with the number of their values; of the last three, all but the first value may be missing.
+# Options of a map and their number of values; the last three may have the first value only.
 _OPTIONS = {
     **dict.fromkeys(("-blendu", "-blendv", "-bm", "-boost", "-cc", "-clamp", "-imfchan", "-texres", "-type"), 1),
     "-mm": 2,
     **dict.fromkeys(("-o", "-s", "-t"), 3),
 }
-# Options without effect on colours: strengths of bumps, sharpness and size of small pictures.
+# Options without effect on colours: strength of bumps, sharpness and size of mipmaps.
 _OPTIONS_WITHOUT_EFFECT = ("-bm", "-boost", "-cc", "-texres")
 _EXPECTED = "Kd, map_Kd (with -s, -o, -mm, -clamp, -blendu and -blendv), Ks, Ns, Ke, d, Tr, illum, Pr and Pm"
 # Numbers of entries, and the texture of ``map_Kd``.
@@ -33,7 +33,7 @@ Material = dict[str, list[float] | SceneNode]
 
 
 def read_materials(path: Path) -> dict[str, Material]:
-    """Materials of an OBJ file by name. Warns if there is no such library, or entries are left out."""
+    """Materials of an OBJ file by name. Warns if there is no such library, or entries are ignored."""
     content = path.read_bytes()
     materials: dict[str, Material] = {}
     for names in re.findall(rb"^[ \t]*mtllib[ \t]+(.+?)\s*$", content, re.MULTILINE):
@@ -48,7 +48,7 @@ def read_materials(path: Path) -> dict[str, Material]:
 
 
 def _libraries(folder: Path, names: str) -> list[Path]:
-    """Files of a statement ``mtllib``: one whose name may have spaces, or several that end in ".mtl"."""
+    """Files of a statement ``mtllib``: one, whose name may have spaces, or several that end in ".mtl"."""
     names = _without_comment(names)
     whole = _file(folder, names)
     if whole.is_file():
@@ -61,7 +61,7 @@ def _file(folder: Path, name: str) -> Path:
 
 
 def _without_comment(line: str) -> str:
-    """A line without its comment, which begins with "#" at the start or between spaces."""
+    """A line without its comment, from a "#" at the start or between spaces."""
     return re.sub(r"(^#|\s#(?=\s|$)).*", "", line.strip()).strip()
 
 
@@ -75,7 +75,7 @@ def _parsed(library: Path, text: str) -> dict[str, Material]:
             materials[rest] = material = {}
         elif key in _NUMBERS:
             values = _leading_numbers(rest.split(), _NUMBERS[key])
-            # A grey may be one number.
+            # One number is a grey.
             values = values * 3 if len(values) == 1 and _NUMBERS[key] == 3 else values
             if len(values) == _NUMBERS[key]:
                 material.setdefault(key, values)
@@ -104,7 +104,7 @@ def _leading_numbers(words: list[str], most: int) -> list[float]:
 
 
 def _texture(folder: Path, text: str, left_out: dict[str, None]) -> SceneNode:
-    # The picture is looked up at ``scale * uv + offset``, and its linear values ``c`` become ``base + gain * c``.
+    # Image coordinates are ``scale * uv + offset``; linear values ``c`` become ``base + gain * c``.
     scale, offset, base_and_gain = [1.0, 1.0, 1.0], [0.0, 0.0, 0.0], [0.0, 1.0]
     is_clamped, is_blended = False, True
     while (option := text.split(None, 1)[0] if text else "") in _OPTIONS:
@@ -143,8 +143,8 @@ def _texture(folder: Path, text: str, left_out: dict[str, None]) -> SceneNode:
 def material_bsdf(material: Material, name: str) -> SceneNode:
     """The BSDF of a material.
 
-    Phong's exponent ``Ns`` becomes a roughness by ``alpha^2 = 2 / (Ns + 2)``, with which a microfacet distribution has
-    as wide a highlight; ``alpha`` is the square of the roughness.
+    Phong's exponent ``Ns`` becomes the roughness of an equally wide highlight: ``alpha^2 = 2 / (Ns + 2)``, where
+    ``alpha`` is the square of the roughness.
     """
     diffuse, highlights = _numbers(material, "Kd", 0.8, 0.8, 0.8), _numbers(material, "Ks", 0.0, 0.0, 0.0)
     colour: SceneNode = {"type": "rgb", "value": np.clip(diffuse, 0, 1).tolist()}

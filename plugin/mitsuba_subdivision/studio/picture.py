@@ -1,4 +1,4 @@
-"""Pictures of limit surfaces: shading, rates that a picture needs, weights of lights, and denoising."""
+"""Pictures of limit surfaces: shading, required rates, weights of lights, and denoising."""
 
 from __future__ import annotations
 
@@ -18,29 +18,27 @@ from ..shapes.parameters import pixel_error_for
 from ..variants import SceneNode
 from .studio_entries import variant_in_use
 
-# Largest distance of triangles from the surface, in pixels. With exact shading only silhouettes show it. Interpolated
-# normals need more: a 32nd of a pixel is half of one at a quarter of the segments.
+# Largest distance of triangles from the surface in pixels, by shading. With exact shading, only silhouettes show it.
 ERRORS = {"exact": 0.1, "vertex": 0.5 / 4**2}
-# Quantile of vertices for the estimated error: borders and creases look more curved than they are, and few vertices are
-# at outlines.
+# Quantile of vertices for the estimated error: it overestimates borders and creases, and few vertices are at outlines.
 MOST_VERTICES = {"exact": 0.95, "vertex": 0.99}
-# Most segments on each edge of a cage: of uniform and of adaptive tessellations that a picture needs.
+# Most segments on each edge of a cage: of uniform and of adaptive tessellations.
 MOST_SEGMENTS, FINEST_RATE = 8, 64
-# Most triangles of all surfaces of a scene, and uniform triangles that take as long as the choice of adaptive ones.
+# Most triangles of a scene; and the number of uniform triangles that take as long as choosing adaptive ones.
 MOST_TRIANGLES, FEW_TRIANGLES = 4_000_000, 20_000
-# Samples per pixel of albedo and normals, one ray each; more, up to 256, improve neither edges nor blurred parts.
+# Samples per pixel of albedo and normals, one ray each; 256 improve neither edges nor blurred parts.
 AUXILIARY_SPP = 64
-# Least number of lights that are weighed, and least ratio of the mean square of their contributions to the square of
-# the mean: equal choices are better for two or equal lights. Then the least part of a weight, and rays for each light.
+# Least number of lights to weigh, and least ratio of the mean square of their contributions to the squared mean: equal
+# probabilities are better for two or equal lights. Then the least share of a weight, and rays for each light.
 LEAST_LIGHTS, LEAST_UNEVEN, LEAST_WEIGHT, SCOUTS = 3, 1.3, 0.03, 2 * 160 * 120
 _AUXILIARY = "albedo:albedo,normal:sh_normal"  # AOVs of the denoiser, the last six channels of the film
 
 
 def shading_for(parameters: SceneNode) -> str:
-    """Shading of shapes ``subdivision`` with these parameters in the current variant, "exact" or "vertex".
+    """Shading of ``subdivision`` shapes with these parameters in the current variant, "exact" or "vertex".
 
-    If exact shading does not work, or takes long, a line on standard error says so, as warnings may be errors.
-    Raises ValueError if the shading is unknown.
+    If exact shading does not work, or is slow, a line on standard error says so, as warnings may be errors. Raises
+    ValueError if the shading is unknown.
     """
     shading = parameters.get("shading", "auto")
     if shading not in SHADINGS:
@@ -63,12 +61,12 @@ def segments_for(
     near_clip: float,  # Of the sensor
     shading: str,
 ) -> NDArray[np.int64]:
-    """Rates ``(n,)`` of a cage, up to `FINEST_RATE`, at which an image shows no facets of its copies."""
+    """Rates ``(n,)`` of a cage's copies, up to `FINEST_RATE`, without visible facets in an image."""
     box = np.array([(x.min(), x.max()) for x in cage.positions.T]).T
     stretch = np.linalg.norm(to_world[:, :3, :3], 2, axis=(1, 2))
     corners = points_at(box_corners(box), to_world)
     error = _deviation(cage, shading) * stretch * pixels_of_boxes(corners, outline, near_clip)
-    # At twice the rate, triangles are four times as near.
+    # Twice the rate has a quarter of the distance.
     segments = np.ceil(np.sqrt(np.minimum(error / ERRORS[shading], FINEST_RATE**2)))
     return np.maximum(1, segments.astype(np.int64))
 
@@ -77,7 +75,7 @@ def highest_rate(
     segments: NDArray[np.integer],  # (n,) int: rate that each cage needs
     corners: NDArray[np.integer],  # (n,) int: corners of its faces
 ) -> int:
-    """Largest rate, up to `FINEST_RATE`, at which cages have no more than `MOST_TRIANGLES`."""
+    """Largest rate, up to `FINEST_RATE`, with at most `MOST_TRIANGLES` of all cages."""
     # A quadrilateral has four corners, and two triangles for each square of the rate.
     rates = np.arange(2, FINEST_RATE + 1)
     triangles = (np.minimum(segments, rates[:, None]) ** 2 * corners).sum(axis=1) // 2
@@ -85,7 +83,7 @@ def highest_rate(
 
 
 def outline_for(sensor: SceneNode) -> SceneNode:
-    """Parameters of exactly shaded shapes with exact outlines for a sensor, an entry of a scene."""
+    """Parameters of shapes with exact shading and accurate outlines for a sensor, an entry of a scene."""
     return pixel_error_for(mi.load_dict(sensor), ERRORS["exact"], outline=True)
 
 
@@ -96,7 +94,7 @@ def triangles_for(
     outline: SceneNode,  # See `outline_for`
     highest: int,  # Highest adaptive rate
 ) -> SceneNode:
-    """Parameters of an exactly shaded shape in a still picture, adaptive unless uniform triangles are few."""
+    """Parameters of a shape with exact shading in a still picture: adaptive, unless uniform triangles are few."""
     is_enough = segments <= most and segments**2 * corners <= 2 * FEW_TRIANGLES
     if is_enough or min(segments, highest) == 1:
         return {"tessellation_rate": min(segments, most)}
@@ -106,9 +104,9 @@ def triangles_for(
 def _deviation(cage: ControlCage, shading: str) -> float:
     """Distance of a cage's faces from its surface, in object space, for most vertices.
 
-    Where a surface of curvature ``k`` bends one way, chords of length ``h`` are up to ``k h^2 / 8`` away from it, and
-    vertices lie ``k h^2 / 4`` beside the middle of their four neighbours; where it bends both ways, diagonals are twice
-    as far away, and so are the vertices.
+    On a surface that bends one way with curvature ``k``, chords of length ``h`` are up to ``k h^2 / 8`` away, and
+    vertices are ``k h^2 / 4`` away from the middle of their four neighbours. On a surface that bends both ways, both
+    distances are twice as large.
     """
     t = cage.topology
     used = t.vertex_face_count > 0
@@ -132,16 +130,17 @@ def pixels_of_boxes(corners: NDArray[np.float64], outline: SceneNode, near_clip:
 
 
 def weigh_lights(scene: mi.Scene, sensor: int = 0) -> bool:
-    """Choose lights as often as they matter in a picture, by their ``sampling_weight``; pictures stay unbiased.
+    """Set the ``sampling_weight`` of lights to their contributions to a picture, which stays unbiased.
 
-    Mitsuba chooses all alike. Here, each light is rendered alone, as direct light, with a few rays, and none gets below
-    0.03 of the sum. Equal choices spread evenly over the samples of a pixel: weights pay for uneven lights only.
+    Mitsuba samples all lights with equal probability. Here, the direct light of each is rendered with a few rays; no
+    weight is below 0.03 of the sum. Equal probabilities spread samples evenly over a pixel, so weights help for uneven
+    lights only.
 
     Parameters
     ----------
     scene : mi.Scene
-        Its lights are changed, unless they are fewer than 3, nearly even or have weights of their own, or the variant
-        is a scalar one.
+        Its lights are changed, unless they are fewer than 3, nearly equal or already weighted, or the variant is
+        scalar.
     sensor : int
         The sensor of the picture.
 
@@ -176,7 +175,7 @@ def weigh_lights(scene: mi.Scene, sensor: int = 0) -> bool:
 
 
 def require_denoiser() -> None:
-    """Raise ValueError if the package of the denoiser is missing, before a picture is rendered."""
+    """Raise ValueError before rendering if the denoiser's package is missing."""
     try:
         import mitsuba_oidn  # noqa: F401 - only to find out whether it is there
     except ImportError as error:
@@ -191,15 +190,14 @@ def render_denoised(
 ) -> NDArray[np.float32]:
     """Render a scene with the box filter, and remove its noise by Open Image Denoise.
 
-    With a wider filter, noise of neighbouring pixels would be correlated, and the denoiser would keep it. Albedo and
-    normals of the first hits preserve textures and edges. Denoised pictures are biased: do not compare them, or take
-    them for references.
+    With a wider filter, noise of neighbouring pixels is correlated, and the denoiser keeps it. Albedo and normals of
+    the first hits preserve textures and edges. Denoised pictures are biased: do not compare them or use them as
+    references.
 
     Parameters
     ----------
     scene : path of an XML file, dictionary, or mi.Scene
-        As `studio_scene` and `usd_scene` make it. A loaded scene must have the box filter already. A variant of Mitsuba
-        must be set.
+        As of `studio_scene` and `usd_scene`. A loaded scene must have the box filter. A variant of Mitsuba must be set.
     spp : int, optional
         Samples per pixel; by default those of the scene.
     seed : int
@@ -225,7 +223,7 @@ def render_denoised(
 
 
 def denoised(loaded: LoadedScene, pixels: NDArray[np.float32], seed: int = 0) -> NDArray[np.float32]:
-    """Remove the noise of a picture ``(height, width, channels)`` that was rendered with the box filter.
+    """Remove the noise of a picture ``(height, width, channels)`` rendered with the box filter.
 
     Raises ValueError if the picture has no R, G and B.
     """

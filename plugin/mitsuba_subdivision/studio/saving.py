@@ -24,32 +24,30 @@ from ..shapes.parameters import is_attribute_parameter, ranges_as_text, read_att
 from ..variants import SceneNode
 from ..whole_file import require_writable, whole_file, write_text
 
-# Properties of the shape that `ControlCage.from_arrays` takes, too.
+# Properties of the shape that are also arguments of `ControlCage.from_arrays`.
 _ARRAYS = ("positions", "face_sizes", "face_vertices", "creases", "corners", "holes")
 _OF_CAGE = (*_ARRAYS, *RULES)
 _NUMBERS = re.compile(r"<(float|rgb|spectrum|point|vector) [^>]*>")
 _NUMBER = re.compile(r"(?<![\w.])-?\d+\.?\d*(?:e[-+]?\d+)?(?![\w.])")
-# In place of a transform, while the scene is written.
+# Placeholder of a transform while the scene is written.
 _PLACEHOLDER = "in place of transform"
 _TRANSFORM = re.compile(rf'( *)<string name="([^"]*)" value="{_PLACEHOLDER} (\d+)"/>\n')
 DIGITS = 9  # Significant digits where single precision is not enough
-_ORTHOGONAL = 1e-6  # Tolerance for the orthogonality of a matrix that is written as a scale and a direction
+_ORTHOGONAL = 1e-6  # Tolerance for the orthogonality of a matrix written as scale and direction
 
 
 def save_scene(
-    # As for `mi.load_dict`; a shape of a file may have, as `mesh`, an object with the suffix of the file and a method
-    # `save` that takes a path
+    # As for `mi.load_dict`; a shape of a file may have, as `mesh`, an object with `suffix` and `save(path)`
     scene: SceneNode,
     path: Path,
-    inputs: Iterable[Path] = (),  # Files that must not be written to, besides those that the scene names
+    inputs: Iterable[Path] = (),  # Files that must not be overwritten, besides those of the scene
 ) -> list[Path]:
     """Write a scene as XML, so that it renders to the same picture.
 
-    Names of files in it become relative to it. Data in memory is written beside it, as ``NAME_ENTRY``
-    with a suffix: cages as OBJ files, or as PLY or USD files if they have data that OBJ files cannot hold; polygon
-    meshes as PLY files; images as PNG or EXR files.
-    Returns the written files, the scene last. Raises ValueError, before anything is written, if the path does not end
-    in .xml, no file format holds an entry, or a file to write is an input. Raises OSError if a file cannot be written.
+    File names in it become relative. Data in memory are written beside it, as ``NAME_ENTRY`` with a suffix: cages as
+    OBJ files, or as PLY or USD files if OBJ files cannot store all data; polygon meshes as PLY files; images as PNG or
+    EXR files. Returns the written files, the scene last. Raises ValueError, before writing, if the path does not end in
+    .xml, no file format can store an entry, or an output is an input. Raises OSError if a file cannot be written.
     """
     if path.suffix.lower() != ".xml":
         raise ValueError(f'scene "{path}"; expected a name ending in .xml')
@@ -68,8 +66,8 @@ def save_scene(
 
 
 def _as_text(state: mi.parser.ParserState) -> str:
-    """A parsed scene as XML, with transforms as look-at, and without digits beyond single precision."""
-    # Mitsuba would leave out numbers below 1e-6 in transforms, whatever the unit.
+    """A parsed scene as XML, with look-at transforms and the digits of single precision."""
+    # Mitsuba would drop numbers below 1e-6 in transforms.
     transforms: list[NDArray[np.float64]] = []
     for node in state.nodes:
         for key in [key for key, _ in node.props.items() if node.props.type(key) == mi.Properties.Type.Transform]:
@@ -89,7 +87,7 @@ def _as_text(state: mi.parser.ParserState) -> str:
 
 
 def _steps(matrix: NDArray[np.float64]) -> list[str]:
-    """Tags that make up a transform ``(4, 4)``, the first step first; none for the identity."""
+    """Tags of a transform ``(4, 4)``, the first step first; none for the identity."""
     linear, origin = matrix[:3, :3], matrix[:3, 3]
     sides = np.linalg.norm(linear, axis=0)
     axes = linear / np.where(sides > 0, sides, 1)
@@ -97,7 +95,7 @@ def _steps(matrix: NDArray[np.float64]) -> list[str]:
         return [*_tag("scale", np.diag(linear), 1), *_tag("translate", origin, 0)]
     if np.abs(axes.T @ axes - np.eye(3)).max() > _ORTHOGONAL or np.linalg.det(axes) < 0:
         return [f'<matrix value="{" ".join(map(_short, matrix.ravel().tolist()))}"/>']
-    # As far away as the origin is from 0: digits of the difference of two points are lost. They get more.
+    # The difference of two points loses digits far from 0, so these have more.
     reach = max(1.0, float(np.abs(origin).max()))
     vectors = {"origin": origin, "target": origin + reach * axes[:, 2], "up": axes[:, 1]}
     directions = (f'{name}="{", ".join(f"{x:.{DIGITS}g}" for x in vector)}"' for name, vector in vectors.items())
@@ -113,24 +111,24 @@ def _tag(name: str, values: NDArray[np.float64], neutral: float) -> list[str]:
 
 
 def _short(value: float) -> str:
-    """The fewest digits that are the same number in single precision."""
+    """The fewest digits of a single-precision number."""
     return str(np.float32(value)).removesuffix(".0")
 
 
 class _SceneParts:
     def __init__(
         self,
-        path: Path,  # Of the scene's XML file. A part of the entry NAME becomes `SCENE_NAME` with a suffix.
-        inputs: Iterable[Path],  # Files that must not be written to
+        path: Path,  # Of the scene's XML file. Data of the entry NAME become `SCENE_NAME` with a suffix.
+        inputs: Iterable[Path],  # Files that must not be overwritten
     ) -> None:
         self._path, self._inputs = path, list(inputs)
         self._writers: dict[Path, Callable[[Path], None]] = {}
         self._pictures: dict[str, Path] = {}
-        # Files of cages, and rules that the scene keeps, by the identity of their arrays.
+        # Files of cages and rules that stay in the scene, by the identity of their arrays.
         self._cages: dict[tuple[tuple[str, Any], ...], tuple[Path, SceneNode]] = {}
 
     def in_files(self, name: str, node: SceneNode) -> SceneNode:
-        """A scene entry with names of files in place of data. Raises ValueError for an object of Mitsuba."""
+        """A scene entry with file names in place of data. Raises ValueError for an object of Mitsuba."""
         entry = dict(node)
         if "positions" in node:
             entry = self._with_cage(name, node)
@@ -173,7 +171,7 @@ class _SceneParts:
             suffix = _suffix_for(name, contents)
             chosen = {}
             if suffix != ".obj":
-                # Rules are tags in OBJ files. Other formats cannot hold some of them; the scene can hold all.
+                # Rules are tags in OBJ files. Other formats cannot store some of them; the scene can.
                 chosen = {rule: value for rule, value in contents.rules.items() if value != RULES[rule][0]}
                 contents = replace(contents, rules={})
             self._cages[alike] = self._file(name, suffix, partial(write_file, contents)), chosen
@@ -202,7 +200,7 @@ class _SceneParts:
 
 
 def _contents(entry: SceneNode) -> CageContents:
-    """The cage of properties of the shape ``subdivision``, without its scheme, which the scene keeps."""
+    """The cage from properties of a ``subdivision`` shape, without its scheme, which stays in the scene."""
     arrays = {key: np.array(entry[key]) for key in _ARRAYS if key in entry}
     rules = {key: entry[key] for key in RULES if key in entry}
     data = read_attributes(entry)

@@ -30,19 +30,19 @@ VIEWS = {
 DEFAULT_VIEW = "three-quarter"
 UP_AXES = ("y", "z")
 View = str | Sequence[float]
-# Field of view of the picture's longer side, in degrees: that of long lenses for products and portraits.
+# Field of view of the picture's longer side, in degrees: as of long lenses for products and portraits.
 FIELD_OF_VIEW = 28.0
 MARGIN = 0.08  # Empty part of the picture on each side
-# Least distance of the nearest point, in depths of the model: the furthest point looks a fifth as large.
+# Least distance of the nearest point, relative to the model's depth: the furthest point looks a fifth as large.
 NEAREST = 0.25
 DEFAULT_SIZE, DEFAULT_SPP, LARGEST_SIDE = (640, 480), 64, 1 << 14
-SIZES = (1e-9, 5e8)  # Measured sizes of models that Mitsuba renders alike: lengths are squared in single precision
-# Largest side of models to enlarge, and their least enlarged side: Mitsuba offsets rays from surfaces by 9e-5 of a
-# unit, or of larger coordinates.
+SIZES = (1e-9, 5e8)  # Measured range of sizes that Mitsuba renders alike: it squares lengths in single precision
+# Largest side of models to enlarge, and least side after that: Mitsuba offsets rays from surfaces by 9e-5 of a unit, or
+# of larger coordinates.
 SMALL, LARGE_ENOUGH = 1.0, 8.0
 LARGEST_BOX = 1e37  # Side of the largest box that is finite in single precision
-# Positions of lights, in radii of the model: right, back and up of its middle, for a camera in front. Then half their
-# sides, their radiance, and their sampling weights of least noise.
+# Lights for a camera in front: positions (right, back, up) from the middle and half sides, both in radii of the model,
+# radiance, and sampling weights of least noise.
 LIGHTS = {
     "key_light": ((-4.4, -1.9, 4.4), (1.5, 1.5), (16.0, 15.4, 14.6), 3.0),
     "fill_light": ((5.5, -4.0, 1.6), (2.5, 2.5), (0.55, 0.58, 0.62), 0.25),
@@ -54,14 +54,14 @@ ENVIRONMENT = "environment"
 # Entries that turn with the camera.
 RIG = (*LIGHTS, "ground", ENVIRONMENT)
 AMBIENT, BACKDROP_COLOUR = (0.17, 0.175, 0.185), (0.30, 0.305, 0.315)
-# Types of Mitsuba's integrator `aov`, by their own names and by those of Hydra and of other renderers.
+# Types of Mitsuba's integrator `aov`, by names of Mitsuba, Hydra and other renderers.
 AOVS = {name: name for name in ("albedo", "depth", "position", "uv", "geo_normal", "sh_normal", "dp_du", "dp_dv")}
 AOVS |= {name: name for name in ("duv_dx", "duv_dy", "prim_index", "shape_index")}
 AOVS |= {"normal": "sh_normal", "normals": "sh_normal", "N": "sh_normal", "Ng": "geo_normal", "P": "position"}
 AOVS |= {"z": "depth", "st": "uv", "primId": "shape_index", "instanceId": "shape_index", "elementId": "prim_index"}
 LENGTHS = ("depth", "position", "dp_du", "dp_dv")
-# Distances in radii: of the bend and the wall of the backdrop from the model's middle; and of the floor from the model,
-# as a flat model must not coincide with it.
+# Distances in radii: of the backdrop's bend and wall from the model's middle; of the floor from the model, as a flat
+# model must not coincide with it.
 BEND, WALL, GAP = 1.6, 7.0, 0.003
 
 
@@ -69,48 +69,48 @@ BEND, WALL, GAP = 1.6, 7.0, 0.003
 class Look:
     """Display options of a model or a stage."""
 
-    view: View = DEFAULT_VIEW  # str or (azimuth, elevation): from where the studio's camera looks
+    view: View = DEFAULT_VIEW  # str or (azimuth, elevation) of the studio's camera
     # Width and height in pixels; None for those of a stage's render settings or camera, or 640 by 480
     size: tuple[int, int] | None = None
     spp: int | None = None  # Samples per pixel; None for those of a stage's render settings, or 64
-    up: str | None = None  # Axis of a cage that points up; None for that of its file
+    up: str | None = None  # Up axis of a cage; None for its file's
     rate: int | None = None  # Segments on each edge of a cage; None for as many as a picture needs
     shading: str = "vertex"  # Of a cage
-    checker: bool = False  # Whether texture coordinates of a cage are shown as a checkerboard
-    cage: bool = False  # Whether the control cage is drawn over its surface
-    texture_size: int | None = None  # Most pixels along the sides of a stage's textures; None for no limit
+    checker: bool = False  # Whether a checkerboard shows texture coordinates
+    cage: bool = False  # Whether the control cage is shown over its surface
+    texture_size: int | None = None  # Most pixels along a side of a stage's textures; None for no limit
     transparent: bool = False  # Whether the picture has alpha and no background
     has_studio: bool = True  # Whether the studio adds missing lights, and a backdrop
     scales: bool = False  # Whether small models are enlarged, see `enlargement`
-    # Picture of the light from all directions, of equal angles, in place of all lights and the backdrop; its turn about
-    # the axis that points up, in degrees, counter-clockwise seen from above; and the factor of its radiance
+    # Latitude-longitude environment map, which replaces all lights and the backdrop; its rotation about the up axis, in
+    # degrees, counter-clockwise seen from above; and a factor of its radiance
     environment: Path | None = None
     turn: float = 0.0
     strength: float = 1.0
-    # Types of Mitsuba's AOVs by the names of their channels, besides those of a stage; None for no AOVs at all
+    # Types of Mitsuba's AOVs by channel names, besides those of a stage; None for no AOVs at all
     aovs: Mapping[str, str] | None = None
 
 
 def enlargement(size: float) -> float:
-    """Factor of all lengths, a power of two, for a model whose largest side is given: 1 unless it is small."""
+    """Factor of all lengths, a power of two, for a model of a given largest side: 1 unless it is small."""
     return 2.0 ** math.ceil(math.log2(LARGE_ENOUGH / size)) if 0 < size < SMALL else 1.0
 
 
 def studio(
-    bounds: ArrayLike,  # (2, 3): least and greatest coordinates of the model, in the world
+    bounds: ArrayLike,  # (2, 3): least and greatest coordinates of the model in world space
     *,
-    up: str = "z",  # Axis of the world that points up: "z" or "y"
+    up: str = "z",  # Up axis of the world: "z" or "y"
     # As for `studio_scene`
     view: View = DEFAULT_VIEW,
     size: tuple[int, int] = DEFAULT_SIZE,
     spp: int | None = DEFAULT_SPP,
-    # (n, 3): of the model in the world, within the bounds. The camera frames these; by default, the box.
+    # (n, 3): points of the model in world space that the camera frames; by default, the box.
     points: ArrayLike | None = None,
-    name: str | None = None,  # Of the model, or of its file, with which messages begin
+    name: str | None = None,  # Of the model or its file, for messages
 ) -> SceneNode:
     """Entries of a scene around a model: "integrator", "sensor", lights and, in views from above, "ground".
 
-    A variant of Mitsuba must be set. The studio is sized for the model, and its lights turn with the camera. In views
+    A variant of Mitsuba must be set. The studio has the model's size, and its lights turn with the camera. In views
     from below there is no floor, and lights come from below. Raises ValueError if no variant is set, or an argument is
     invalid. Warns if Mitsuba's single precision cannot render the size of the model.
     """
@@ -143,7 +143,7 @@ def studio(
             "fov_axis": "larger",
             "near_clip": 1e-3 * distance,
             "far_clip": 100 * (distance + radius),
-            # Mitsuba's cameras have x to the left.
+            # In Mitsuba's cameras, x points to the left.
             "to_world": _transform(np.stack([-right, up_in_picture, forward], axis=1), axes @ origin),
             "film": {"type": "hdrfilm", "width": int(size[0]), "height": int(size[1]), "component_format": "float32"},
             "sampler": sampler(int(spp)),
@@ -158,7 +158,7 @@ def studio(
         scene[light] = {"type": "rectangle", "to_world": placed @ scale, "emitter": emitter}
     scene["ambient_light"] = {"type": "constant", "radiance": _rgb(AMBIENT), "sampling_weight": 0.6}
     if not from_below:
-        # The camera stands on the floor and sees neither its sides nor the top of the wall, however far away it is.
+        # The camera stands on the floor and sees neither its sides nor the top of the wall, at any distance.
         extent = distance + WALL * radius
         sweep = _backdrop(1.5 * extent, BEND * radius, WALL * radius, 2 * WALL * radius + extent, 2 * extent)
         scene["ground"] = {
@@ -171,7 +171,7 @@ def studio(
 
 
 def finished(scene: SceneNode, look: Look, up: str) -> SceneNode:
-    """A scene with the environment, the AOVs and the background of a look."""
+    """A scene with the environment, AOVs and background of a look."""
     left: tuple[str, ...] = ("ground",) if look.transparent else ()
     if look.environment is not None or not look.has_studio:
         left = STUDIO
@@ -205,7 +205,7 @@ def framed(
     elevation: float,
     size: tuple[int, int],  # (width, height)
 ) -> tuple[NDArray[np.float64], float]:
-    """Place a camera so that points fill its image, centred, within `MARGIN`, unless they are deeper than wide.
+    """Place a camera so that points fill its image, centred, up to `MARGIN`; models deeper than wide are smaller.
 
     Returns its place in the studio's axes, and its distance from the middle of the points, along the view.
     """
@@ -217,13 +217,13 @@ def framed(
         above, below = (along - slope * z).max(), (-along - slope * z).max()
         nearest.append(-(above + below) / (2 * slope))
         middle.append((above - below) / 2)
-    # A nearer camera would distort models that are long along the view, and could lie inside a thin tip.
+    # A nearer camera would distort models that are long along the view, or lie inside a thin tip.
     depth = min(*nearest, z.min() - NEAREST * (z.max() - z.min()))
     return axes @ np.array([*middle, depth]), float((z.min() + z.max()) / 2 - depth)
 
 
 def outermost(points: NDArray[np.float64], up: str, view: View, size: tuple[int, int]) -> NDArray[np.float64]:
-    """Subset of points in the world with the same camera of `framed`, and the same bounds."""
+    """Subset of world-space points with the same bounds and the same camera of `framed`."""
     x, y = _slopes(size)
     # Normals of the sides of the view frustum, its direction, and the axes.
     towards = np.array([[1, 0, -x], [-1, 0, -x], [0, 1, -y], [0, -1, -y], [0, 0, 1], [0, 0, -1]])
@@ -232,7 +232,7 @@ def outermost(points: NDArray[np.float64], up: str, view: View, size: tuple[int,
 
 
 def _slopes(size: tuple[int, int]) -> NDArray[np.float64]:
-    """Half extents of the view frustum within its margin, per unit of depth, horizontally and vertically."""
+    """Horizontal and vertical half extents of the view frustum within its margin, per unit of depth."""
     return np.tan(np.radians(FIELD_OF_VIEW / 2)) * np.array(size) / max(size) * (1 - 2 * MARGIN)
 
 
@@ -245,7 +245,7 @@ def camera_axes(azimuth: float, elevation: float) -> NDArray[np.float64]:
 
 
 def angles_of(view: View) -> tuple[float, float]:
-    """Azimuth and elevation in degrees of a view, which is a name in `VIEWS`, or two angles.
+    """Azimuth and elevation in degrees of a view: a name in `VIEWS`, or two angles.
 
     Raises ValueError if there is no such view, or the elevation is not between -90 and 90.
     """
@@ -262,10 +262,10 @@ def angles_of(view: View) -> tuple[float, float]:
 
 
 def studio_axes(up: str) -> NDArray[np.float64]:
-    """Directions of the studio in the world: columns right, back and up ``(3, 3)``, of a viewer before the front.
+    """Axes of the studio in the world: columns right, back and up ``(3, 3)``, for a viewer in front.
 
-    A model's front is that of modelling programs: -y where z is up, +z where y is up.
-    Raises ValueError if the axis is neither y nor z.
+    As in modelling programs, the front is -y if z is up, +z if y is up. Raises ValueError if the axis is neither y nor
+    z.
     """
     if up not in UP_AXES:
         raise ValueError(f'up axis "{up}"; expected {" or ".join(UP_AXES)}')
@@ -279,9 +279,9 @@ def turned(azimuth: float) -> NDArray[np.float64]:
 
 
 def sampler(spp: int) -> SceneNode:
-    """Well-spread samples of a pixel, at least so many, as for ``mi.load_dict``.
+    """A stratified sampler with at least this many samples, for ``mi.load_dict``.
 
-    They fill a grid: 32 become 35, as 5 times 7; Mitsuba would do so with a warning.
+    Samples fill a grid: 32 become 5 times 7. Mitsuba would do so with a warning.
     """
     rows = math.isqrt(spp)
     return {"type": "multijitter", "sample_count": -(-spp // rows) * rows}
@@ -317,15 +317,15 @@ def _checked_bounds(bounds: ArrayLike, prefix: str) -> NDArray[np.float64]:
 
 
 def _backdrop(
-    front: float,  # How far the floor reaches towards -y; more than `wall - 2 * bend`
-    # Where, towards +y, the floor begins to bend, and where the wall stands upright, at the height `wall - bend`
+    front: float,  # Extent of the floor towards -y; more than `wall - 2 * bend`
+    # y of the floor's bend, and of the upright wall, which begins at the height `wall - bend`
     bend: float,
     wall: float,
     height: float,  # Of the wall; more than `2 * (wall - bend)`
     half_width: float,
 ) -> ControlCage:
     """Cage of a sweep across the x axis: the floor is z = 0, and the wall rises towards +y."""
-    # A cubic spline is straight where four control points in a row are.
+    # A cubic spline is straight along four collinear control points.
     step = wall - bend
     floor = [[-front, 0], [bend - step, 0], [bend, 0]]
     profile = np.array([*floor, [wall, 0], [wall, step], [wall, 2 * step], [wall, height]])
