@@ -212,12 +212,8 @@ def test_every_writer_reports_a_full_disk_and_keeps_the_old_file(tmp_path, np_rn
     def draw(path):
         draw_picture(FigureOptions(tmp_path, formats=("png",)), path.stem, pixels, cage="none")
 
-    writers = {
-        "a.exr": lambda path: write_exr(path, pixels),
-        "b.exr": write_bitmap,
-        "b.hdr": write_bitmap,
-        "c.png": draw,
-    }
+    writers = {"a.exr": lambda path: write_exr(path, pixels), **dict.fromkeys(("b.exr", "b.hdr"), write_bitmap)}
+    writers["c.png"] = draw
     writers |= {f"d.{suffix}": LimitSurface(cage).tessellate(2).save for suffix in ("obj", "ply", "usda", "usdc")}
     writers |= {f"e.{suffix}": cage.save for suffix in ("obj", "ply", "usda", "usdc")}
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -13,9 +13,8 @@ def cycles(clock, stage, camera):
     """Render a stage twice by a camera of Mitsuba's; Catmull-Clark meshes at one pixel, by adaptive subdivision."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     clock.lap("imports")
-    bpy.ops.wm.usd_import(
-        filepath=stage, import_subdivision=True, import_cameras=False, apply_unit_conversion_scale=False
-    )
+    unlike = {"import_cameras": False, "apply_unit_conversion_scale": False}
+    bpy.ops.wm.usd_import(filepath=stage, import_subdivision=True, **unlike)
     clock.lap("read")
     scene = bpy.context.scene
     _subdivide([mesh for mesh in bpy.data.objects if mesh.type == "MESH"])

@@ -79,9 +79,6 @@ def textured(cage, indices, rng, **options):
     return tagged(cage, texcoords=face_varying(rng.random((indices.max() + 1, 2)), indices), **options)
 
 
-# Independent refinement
-
-
 def as_cage(points, texcoords, options):
     """Cage of points and texture coordinates that the reference has refined."""
     positions = {vertex: point for (vertex, _), point in points.values.items()}
@@ -173,9 +170,6 @@ def test_semi_sharp_edges_hold_values_across_creases_but_not_semi_sharp_vertices
         assert_refined_alike(cage, "catmull_clark", 2, np_rng)
 
 
-# Laws
-
-
 @EVERY_CAGE
 def test_without_seams_values_are_subdivided_as_points_are(scheme, cage, np_rng):
     tags = random_tags(cage, np_rng, 0.1, (0.5, 1.75, INFINITE))
@@ -231,9 +225,6 @@ def test_a_constant_stays_one(np_rng):
     assert (surface.evaluate_attribute("one", *random_locations(surface, np_rng)) == 0.1).all()
 
 
-# Doo-Sabin
-
-
 def test_doo_sabin_interpolates_attributes_without_seams(np_rng):
     cage = torus(5, 4)
     texcoords, attributes = face_varying(cage.positions[:, :2], cage.face_vertices), {"vertex": cage.positions}
@@ -261,10 +252,7 @@ def test_doo_sabin_refuses_seams_and_linear_attributes(attribute, mode, message)
         surface.tessellate(2)
 
 
-@pytest.mark.parametrize(
-    ("attributes", "expected"),
-    [({}, "a cage with attributes"), ({"a": Attribute(np.zeros((8, 1)))}, "expected one of a")],
-)
+@pytest.mark.parametrize(("attributes", "expected"), [({}, "a cage with attribut"), ({"a": np.zeros((8, 1))}, "of a")])
 def test_unknown_attributes_name_the_known_ones(attributes, expected):
     surface = LimitSurface(tagged(cube(), attributes=attributes))
     with pytest.raises(ValueError, match=f'control cage has no attribute "texcoords"; .*{expected}'):

@@ -80,9 +80,6 @@ def test_equal_parts_of_a_crease_are_refined_once(monkeypatch):
     assert len(refined) < 30
 
 
-# What can be wrong
-
-
 class NeverIsolates(CatmullClark):
     regular_valence = 5
 

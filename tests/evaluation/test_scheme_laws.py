@@ -175,27 +175,15 @@ class OtherBorder(CatmullClark):
 @pytest.mark.parametrize(
     ("scheme", "message"),
     [
-        (
-            ChangedCatmullClark("leaking", lambda matrix, _: 1.001 * matrix),
-            "leaking: .* has weights that sum to 1.001; expected 1",
-        ),
+        (ChangedCatmullClark("leaking", lambda matrix, _: 1.001 * matrix), "leaking: .* has weights that sum to 1.001"),
         (OtherBasis(), "other_basis: row 1 of the regular basis is wrong by"),
         (OtherBorder(), "other_border: the regular basis does not fit the rules"),
         (WrongDerivatives(), "wrong_derivatives: row 1 of the regular basis is wrong by"),
         (TooWide(), "too_wide: "),
-        (
-            ChangedCatmullClark("standing", standing),
-            "standing: subdivision matrix of .*: the second eigenvalue has modulus 1; expected below 1",
-        ),
+        (ChangedCatmullClark("standing", standing), "standing: .*: the second eigenvalue has modulus 1;"),
         (SHARPENED, "sharpened: has_convex_rules, but a weight of -"),
-        (
-            ChangedCatmullClark("far_border", far_border),
-            "far_border: has_local_borders, but an inner vertex has a weight",
-        ),
-        (
-            ChangedCatmullClark("by_valence", by_valence),
-            "by_valence: has_local_borders, but weights beside a border depend on a valence",
-        ),
+        (ChangedCatmullClark("far_border", far_border), "has_local_borders, but an inner vertex has a weight"),
+        (ChangedCatmullClark("by_valence", by_valence), "but weights beside a border depend on a valence"),
     ],
     ids=lambda value: getattr(value, "name", ""),
 )

@@ -25,9 +25,8 @@ SIGMAS, INTERPOLATION = 4, 0.003
 
 def disc_luminance(valence, **parameters):
     """Mean luminance of the disc around the vertex, and its standard error."""
-    scene = mi.load_file(
-        str(SCENES / f"valence{valence}.xml"), resolution=str(RESOLUTION), spp=str(SPP), fov="5", **parameters
-    )
+    parameters |= {"resolution": str(RESOLUTION), "spp": str(SPP), "fov": "5"}
+    scene = mi.load_file(str(SCENES / f"valence{valence}.xml"), **parameters)
     point = surface_of("catmull_clark", valence).evaluate(0, [[0.0, 0.0]]).p[0]
     centre, edge = project(scene.sensors()[0], np.stack([point, point + np.array([RADIUS, 0, 0])]))
     y, x = np.indices((RESOLUTION, RESOLUTION)) + 0.5
@@ -62,10 +61,8 @@ def test_only_stam_with_an_offset_cage_has_the_artefact():
         centred = type(surface)(surface.cage.with_positions(surface.cage.positions - limit))
         for at, lost in ((surface, True), (centred, False)):
             assert (vertex_normal(at, "stam", offset)[2] > 45) == lost
-        stam, stabilised, limit = (
-            vertex_normal(surface, evaluator, offset if is_beside else 0.0)
-            for _, evaluator, is_beside in normal_error.RULES
-        )
+        rules = ((evaluator, offset * is_beside) for _, evaluator, is_beside in normal_error.RULES)
+        stam, stabilised, limit = (vertex_normal(surface, *rule) for rule in rules)
         # Each is its level, the distance from the origin and the error.
         assert stam[2] > 45
         assert max(stabilised[2], limit[2]) < 1e-4

@@ -231,9 +231,6 @@ def test_materials_of_ply_files_have_numbers(tmp_path):
     assert named(ControlCage.from_file(tmp_path / "cage.ply")) == expected
 
 
-# Triangles
-
-
 @pytest.fixture(scope="module")
 def triangles():
     return LimitSurface(extraordinary(5)).tessellate(3)

@@ -106,9 +106,7 @@ def test_agrees_with_a_reader_of_lines(content, obj_file):
     assert_reads_as(content, obj_file(content))
 
 
-@pytest.mark.parametrize(
-    "statement", ["v 0 0 {}", "vt {} 0", "f 1 2 {}", "f 1/{} 2 3", "t hole {}/0/0 1", "t hole 1/0/0 {}"]
-)
+@pytest.mark.parametrize("statement", ["v 0 0 {}", "vt {} 0", "f 1 2 {}", "f 1/{} 2 3", "t a {}/0/0 1", "t a 1/0/0 {}"])
 @pytest.mark.parametrize("end", ["x", "-"])
 def test_many_digits_are_read_as_fast_as_any_text(obj_file, statement, end):
     """It would take hours with a search that goes back for each digit."""
@@ -149,17 +147,11 @@ MALFORMED = [
     (TRIANGLE + "f 1 0 3\n", ["line 4: vertex index 0 is out of range", "expected 1 to 3", "has 3 vertices"]),
     (TRIANGLE + "f 1 2 \\\n 4\n", ["line 5: vertex index 4 is out of range", "expected 1 to 3", "has 3 vertices"]),
     (TRIANGLE + "f 1 2 99999999999999999999\n", ["line 4: vertex index", "expected 1 to 3"]),
-    (
-        f"{TRIANGLE}f -1 -2 -4\nv 0 0 1\n",
-        [f"line 4: vertex index -4 {OUT}", "expected -3 to -1", "3 vertices are above"],
-    ),
+    (f"{TRIANGLE}f -1 -2 -4\nv 0 0 1\n", [f"line 4: vertex index -4 {OUT}", "expected -3 to -1", "3 vertices are"]),
     (TRIANGLE + "vt\nf 1 2 3\n", ["line 4: 0 texture coordinates", "expected at least 1"]),
     (TRIANGLE + "vt 0 o\nf 1 2 3\n", ['line 4: malformed number "o"', DECIMAL]),
     (TRIANGLE + "vt 0 1\nf 1 2/2 3\n", [f"line 5: {TEXCOORD} index 2 {OUT}", "expected 1 to 1", f"has 1 {TEXCOORD}s"]),
-    (
-        f"{TRIANGLE}vt 0 1\nf 1/1 2/-2 3//1\nvt 0 1\n",
-        [f"line 5: {TEXCOORD} index -2 {OUT}", "expected -1 to -1", "are above"],
-    ),
+    (f"{TRIANGLE}vt 0 1\nf 1/1 2/-2 3//1\nvt 0 1\n", [f"line 5: {TEXCOORD} index -2 {OUT}", "expected -1 to -1"]),
     (TRIANGLE + "vt 0 1\nf 1/0 2/1 3/1\n", ["line 5: texture coordinate index 0 is out of range"]),
     (TRIANGLE + "f 1 2", ["line 4: 2 face corners", AT_LEAST_3, "the file ends here"]),
     (TRIANGLE + "f 1 2\nf 1 2 3", ["line 4: 2 face corners", AT_LEAST_3]),
@@ -276,9 +268,7 @@ def test_corners_propagate_with_their_rule_only(read):
 
 UNSUPPORTED, UNKNOWN = "is not supported and has no effect", "has an unknown value .* expected one of {}$"
 WITHOUT_EFFECT = {
-    **dict.fromkeys(
-        ("odd 0/0/0", "faceedit 4/0/1 3 4 1 1 hole", "vertexedit 4/3/3 3 4 1 0 0 0 1 add P v"), UNSUPPORTED
-    ),
+    **dict.fromkeys(("odd 0/0/0", "faceedit 4/0/1 3 4 1 1 a", "vertexedit 4/3/3 3 4 1 0 0 0 1 add P v"), UNSUPPORTED),
     "interpolateboundary 1/0/0 3": UNKNOWN.format("0, 1, 2"),
     "facevaryinginterpolateboundary 1/0/0 6": UNKNOWN.format("0, 1, 2, 3, 4, 5"),
     "creasemethod 0/0/1 odd": UNKNOWN.format("normal, chaikin"),

@@ -200,11 +200,7 @@ ERRORS = [
     ("ascii 1.0", "text 1.0", "line 2: .*expected a PLY file"),
     ("double y", "double x", ": two properties with same name"),
     ("double y", "double why", 'the element "vertex" has no property "y"; expected x, y, z among x, why, z'),
-    (
-        "vertex_indices",
-        "corners",
-        'the element "face" has no property "vertex_indices" or "vertex_index"; .* among corners',
-    ),
+    ("vertex_indices", "corners", '"face" has no property "vertex_indices" or "vertex_index"; .* among corners'),
     ("element face 2", "element strip 2", 'there is no element "face" with rows; the file has vertex (5), strip (2)'),
     ("element vertex", "element point", 'there is no element "vertex" with rows; the file has point (5), face (2)'),
     ("list uchar int", "list uchar float", "the vertex indices of faces have type float32; expected integers"),

@@ -37,11 +37,8 @@ def sky(kind):
 def materials():
     texels = 0.2 + 0.6 * np.random.default_rng(1).random((8, 8, 3))
     texture = {"type": "bitmap", "bitmap": mi.Bitmap(texels.astype(np.float32)), "raw": True}
-    return {
-        "diffuse": {"type": "diffuse"},
-        "rough": {"type": "roughconductor", "alpha": 0.3},
-        "textured": {"type": "diffuse", "reflectance": texture},
-    }
+    rough = {"type": "roughconductor", "alpha": 0.3}
+    return {"diffuse": {"type": "diffuse"}, "rough": rough, "textured": {"type": "diffuse", "reflectance": texture}}
 
 
 def inside(material, light, shape):

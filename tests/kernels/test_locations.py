@@ -16,9 +16,6 @@ ROUNDING = 1e-14
 BEYOND, POINT, CHANGED = 1e-3, 1e-13, 1e-12
 
 
-# Carried over edges
-
-
 def kernel_of(name):
     return surface_named(name), kernel_named(name, "llvm_ad_rgb_double")
 
@@ -107,9 +104,6 @@ def as_seen_from_first(surface, half_edge, uv):
     turns = np.where(surface.patches.is_whole[face], half_edge - elements.face_offsets[face], 0)
     turned = np.array([domain.rotation(int(turn))(place) for turn, place in zip(turns, uv, strict=True)])
     return half_edge - turns, turned
-
-
-# Triangles
 
 
 def triangles_of(name, rate):

@@ -180,8 +180,6 @@ def test_a_scheme_of_a_user_is_evaluated(np_rng):
     assert_same(samples, known.evaluate(*locations), BARS[DOUBLE])
 
 
-# Derivatives
-
 # Of few control points each, as the kernels for derivatives by these take long to compile.
 SMALL = {
     "control points of its own": ("catmull_clark", torus(3, 3)),
@@ -278,9 +276,6 @@ def test_placed_normals_turn_with_the_placed_surface(np_rng):
         ahead, behind = (vectors(at(0.3 + side * du, 0.2 + side * dv).n) for side in (1, -1))
         difference = (ahead - behind) / (2 * step)
         np.testing.assert_allclose(vectors(turn), difference, rtol=0, atol=1e-8 * np.abs(difference).max())
-
-
-# What can be wrong
 
 
 def test_control_points_and_places_have_any_natural_form_but_no_other_number():

@@ -271,12 +271,8 @@ def _non_manifold():
     with_hair = [face if k != 12 else [face[0], 36, *face] for k, face in enumerate(polygons(squares.topology))]
     three = [[0, 0, 0], [1, 0, 0.1], [1, 1, 0], [0, 1.2, 0], [1, -0.5, 1], [0, -0.6, 1], [1, -0.7, -1], [0, -0.5, -1]]
     cages = {
-        "book, a page from its spine to nowhere": made(
-            np.vstack([pages.positions, far]), [*polygons(pages.topology), page]
-        ),
-        "sheet with a hair, nothing interpolated": made(
-            np.vstack([squares.positions, [[2, 2, 3]]]), with_hair, boundary="none"
-        ),
+        "book, a page to nowhere": made(np.vstack([pages.positions, far]), [*polygons(pages.topology), page]),
+        "sheet with a hair": made(np.vstack([squares.positions, [[2, 2, 3]]]), with_hair, boundary="none"),
         "three quads at an edge": made(three, [[0, 1, 2, 3], [1, 0, 5, 4], [0, 1, 6, 7]]),
         "book of three": book(3),
         "book of four without corners": book(4, boundary="edge_only"),

@@ -223,11 +223,7 @@ def test_schemes_with_their_own_numbering_are_errors():
 
 @pytest.mark.parametrize(
     ("scheme", "faces"),
-    [
-        ("catmull_clark", [[0, 1, 2, 2]]),
-        ("catmull_clark", [[3, 4, 4], [1, 5, 3, 4, 0], [1, 2, 3]]),
-        ("loop", [[1, 0, 1]]),
-    ],
+    [(None, [[0, 1, 2, 2]]), (None, [[3, 4, 4], [1, 5, 3, 4, 0], [1, 2, 3]]), ("loop", [[1, 0, 1]])],
 )
 def test_halves_of_an_edge_from_a_vertex_to_itself_stay_apart(scheme, faces, np_rng):
     cage = ControlCage(np_rng.random((6, 3)), faces)

@@ -89,6 +89,10 @@ def test_pictures_are_compared_over_the_union_of_their_data_windows_within_the_d
         with_windows(tmp_path / f"{name}.exr", whole, full, data)
     images = {name: load_image(tmp_path / f"{name}.exr") for name in parts}
     assert np.array_equal(images["cropped"].pixels, whole)
+    # Nothing is hit where there are no pixels.
+    with_windows(tmp_path / "ids.exr", whole, full, parts["cropped"], prim=np.ones((8, 10), np.uint32))
+    inside = np.pad(np.ones((3, 4), bool), [(2, 3), (3, 3)])
+    assert np.array_equal(read_channels(tmp_path / "ids.exr")[0]["prim"], np.where(inside, 1, 2**32 - 1))
     assert compare(images["whole"], images["cropped"]).exit_status == 0
     # Rows 2 to 5 of the columns 3 to 6, where one row of four is black in the other picture.
     result = compare(images["cropped"], images["other"])

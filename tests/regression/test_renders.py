@@ -1,3 +1,4 @@
+import itertools
 import os
 import subprocess
 import sys
@@ -11,10 +12,10 @@ from mitsuba_subdivision import variants
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.commands import pictures
 from mitsuba_subdivision.commands.cluster import render_on_cluster
-from mitsuba_subdivision.regression import RegressionError
+from mitsuba_subdivision.regression import RegressionError, renders
 from mitsuba_subdivision.regression import scene as scenes
 from mitsuba_subdivision.regression.image import Estimate, combine, load_image, read_channels, save_image
-from mitsuba_subdivision.regression.renders import Sampling, merge_passes, render_pass
+from mitsuba_subdivision.regression.renders import Sampling, merge_passes, render_like, render_pass
 from mitsuba_subdivision.regression.scene import LEAST_PART_SPP, PART_SAMPLES, load_scene, parts_of, render_image
 from regression.defects import SCENES
 from regression.random_images import BATCH, SPREAD, estimate, truth
@@ -101,6 +102,14 @@ def test_every_file_of_a_scene_has_a_checksum(loaded, tmp_path):
         file.write("# changed\n")
     changed = load_scene(tmp_path / "valence3.xml", {"resolution": 16})
     assert [name for name in loaded.files if changed.files[name] != loaded.files[name]] == ["cages/valence3.obj"]
+
+
+def test_tests_and_second_attempts_share_no_seed(loaded, monkeypatch):
+    reference = render_pass(loaded, SAMPLING)
+    monkeypatch.setattr(renders, "render_pass", lambda _, sampling: sampling)
+    attempts = itertools.product(range(3), (False, True))
+    seeds = [render_like(reference, SCENE, seed=seed, second_attempt=again).seed for seed, again in attempts]
+    assert len({SAMPLING.seed, *seeds}) == 7
 
 
 def test_invalid_scenes_are_refused(variants_all_rgb, tmp_path):  # noqa: ARG001

@@ -331,8 +331,6 @@ def test_a_cage_far_from_the_origin_has_the_same_normals():
     np.testing.assert_allclose(p + 1000, q, rtol=0, atol=2e-4)
 
 
-# Heights
-
 TEXELS = IMAGE[:4, :7, None]
 # Second differences over a texel, of values that single precision rounds.
 SECOND = 1e-3

@@ -46,10 +46,7 @@ FOUR_TEXCOORDS = {"texcoords": np.zeros((4, 2))}
         ({"shown_faces": "1, 2"}, 'parameter "shown_faces" is "1, 2"; expected ranges such as "0-5 8"'),
         # Mitsuba would render no other shape of the scene beside one without triangles.
         ({"shown_faces": np.arange(0)}, 'parameter "shown_faces" shows no face; expected one at least'),
-        (
-            {"shown_faces": np.array([1]), "scheme": "doo_sabin"},
-            'none for the scheme "doo_sabin", whose surface belongs',
-        ),
+        ({"shown_faces": np.array([1]), "scheme": "doo_sabin"}, 'none for the scheme "doo_sabin", whose surface'),
         # Attributes
         ({"texcoords": np.zeros((8, 3))}, 'parameter "texcoords" has shape (8, 3); expected (n, 2)'),
         ({"texcoords": np.zeros((7, 2))}, 'attribute "texcoords" has 7 values; expected 8, one per vertex'),

@@ -97,9 +97,6 @@ def inside(si, other, resolution=RESOLUTION):
     return ndimage.binary_erosion(both & ~jumps, iterations=2).ravel()
 
 
-# Hits
-
-
 TRIANGLES = [{"tessellation_rate": FINE}, {"tessellation_rate": 1}, {"tessellation": "adaptive", "max_edge": 0.5}]
 
 
@@ -191,9 +188,6 @@ def test_rays_through_folds_move_less_than_a_triangle_and_symmetrically(np_rng):
     assert (apart > NORMAL).mean() < 4e-3
 
 
-# Light
-
-
 def sky():
     """Stripes around the horizon, brighter upwards."""
     rows_, columns = np.indices((16, 64))
@@ -223,9 +217,6 @@ def test_a_bowl_seen_from_inside_does_not_shade_itself():
     assert seen.mean() == pytest.approx(fine.mean(), rel=ENERGY)
     # Noise of 64 samples; a false shadow would halve a pixel.
     assert np.abs(seen - fine).max() < 0.25 * fine.mean()
-
-
-# Everything that a shape carries
 
 
 def rgb(*value):

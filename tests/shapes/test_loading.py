@@ -106,9 +106,6 @@ def test_a_constructor_too_deep_runs_in_its_own_thread():
     assert depths == [1]
 
 
-# Python's garbage collector
-
-
 @scalar
 def test_the_collector_pauses_while_a_shape_is_made(monkeypatch):
     read_parameters, enabled = subdivision_shape.read_parameters, []
@@ -149,9 +146,6 @@ def test_the_collector_runs_again_after_pauses_that_overlap():
     ended.set()
     thread.join()
     assert gc.isenabled()
-
-
-# Sharing
 
 
 def tables(shape):
@@ -242,9 +236,6 @@ def test_nothing_is_kept_when_the_last_shape_has_gone():
     del two
     gc.collect()
     assert [reference() for reference in seen] == [None] * len(seen)
-
-
-# Files
 
 
 def written(cage, path, age=LONG_AGO, more=""):

@@ -118,9 +118,6 @@ assert not heavy & (set(sys.modules) - there), heavy & (set(sys.modules) - there
 """)
 
 
-# Exact shading, where it works
-
-
 def problem():
     return exact_shading_problem(getattr(mi, mi.variant()))
 

@@ -42,8 +42,6 @@ CAGES = {
 }
 with_warnings = pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")
 
-# Construction
-
 
 @pytest.mark.core
 @every_variant
@@ -158,8 +156,6 @@ def test_the_shape_has_its_bsdf_emitter_and_medium_and_says_what_it_is():
     np.testing.assert_array_equal(vertices(shape), before)
 
 
-# Single materials: together they are the surface of all
-
 MATERIALS = {"": [0], "red": [1, 4], "dark blue": [2, 3, 5]}
 
 
@@ -194,9 +190,6 @@ def test_materials_share_their_vertices_bit_by_bit_and_unknown_ones_are_errors(t
             mi.load_dict({**given, **wrong})
 
 
-# Normals and transforms
-
-
 @every_variant
 @pytest.mark.parametrize("flip", [False, True])
 def test_normals_point_outward_on_both_sides_of_a_reflection_and_hits_inward_where_flipped(flip):
@@ -222,8 +215,6 @@ def test_face_normals():
     assert not shape.has_vertex_normals()
     assert dr.allclose(hit(shape).t, 5 - 2 * (5 - si.t), atol=0.1)
 
-
-# Where the shape lies: `to_world`, and places far from the origin
 
 SHIFT = np.array([1e4, -3e3, 1e3]) + 1 / 3
 
@@ -317,9 +308,6 @@ def test_to_world_has_the_type_of_mitsubas_shapes():
     shown, expected = mi.traverse(make()), mi.traverse(mi.load_dict({"type": "rectangle"}))
     assert type(shown["to_world"]) is type(expected["to_world"])
     assert shown.flags("to_world") == expected.flags("to_world")
-
-
-# In a scene
 
 
 @every_variant

@@ -213,9 +213,6 @@ def test_derivatives_do_not_keep_shapes_alive(given, seen, shading):
     assert alive() is None
 
 
-# Outlines
-
-
 def test_edges_between_copies_of_vertices_are_no_outlines():
     shape = load(SEAMED)
     parameters, faces = mi.traverse(shape), buffer(shape, "faces").ravel()

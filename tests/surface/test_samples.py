@@ -105,9 +105,6 @@ def test_vertices_are_samples_where_they_say(name, monkeypatch):
         assert_vertices_are_samples(refined, refined.sampling(3))
 
 
-# Matrices
-
-
 def test_a_rate_gives_the_same_as_its_table():
     surface = LimitSurface(mixed_torus())
     points = surface.tessellation_matrix(2).p @ surface.cage.positions

@@ -65,9 +65,7 @@ def test_the_memory_limit_of_the_process_counts(tmp_path, monkeypatch):
     assert available_memory(system(tmp_path, own="200 100 1")) == 100 * resource.getpagesize()
 
 
-@pytest.mark.parametrize(
-    ("cage", "scheme"), [(named_cages.cube(), None), (tetrahedron(), "loop"), (named_cages.extraordinary(7), None)]
-)
+@pytest.mark.parametrize(("cage", "scheme"), [(tetrahedron(), "loop"), (named_cages.extraordinary(7), None)])
 def test_the_suggested_rate_is_the_highest_possible(cage, scheme, leave, monkeypatch):
     surface = LimitSurface(cage, scheme)
     monkeypatch.setattr("mitsuba_subdivision.tessellation.memory.SMALL", 0)
@@ -136,16 +134,8 @@ OF_ANOTHER_CAGE = (np.zeros((5, 3)), np.zeros((9, 3)), np.full((8, 3), np.nan))
         (LimitSurface.tessellate, (2.5, "8", None, np.array([1, 2])), "tessellation rate .*; expected an integer"),
         (LimitSurface.tessellate, (0, -1), "tessellation rate (0|-1); expected 1 or more"),
         (lambda s, rate: uniform_table(s.patches, rate), (0, -1), "tessellation rate (0|-1); expected 1 or more"),
-        (
-            lambda surface, rate: surface.adaptive_sampling(CHORD, rate),
-            MAX_RATES,
-            "max_rate .*; expected (an integer|1 or more|at most 1024)",
-        ),
-        (
-            lambda surface, points: surface.adaptive_sampling(CHORD, control_points=points),
-            OF_ANOTHER_CAGE,
-            r"control points of shape .*; expected finite ones of shape \(8, 3\)",
-        ),
+        (lambda s, rate: s.adaptive_sampling(CHORD, rate), MAX_RATES, "expected (an integer|1 or more|at most 1024)"),
+        (lambda s, p: s.adaptive_sampling(CHORD, control_points=p), OF_ANOTHER_CAGE, r"finite ones of shape \(8, 3\)"),
         (lambda _, error: Criterion("chord", error), (-1e-3, np.nan), "expected a number from 0 on"),
     ],
 )

@@ -233,7 +233,7 @@ OPEN_WIDTH = 0.25 * np.sqrt(2 / (1 + 0.5**2))
     [
         # Of Standard Surface: widths are r^2 / sqrt(1 - a) and r^2 sqrt(1 - a); the others have others.
         ("standard_surface", ROUGH_METAL, (0.5, 0.125)),
-        ("standard_surface", {**ROUGH_METAL, "specular_rotation": 0.25}, (0.125, 0.5)),
+        *(("standard_surface", {**ROUGH_METAL, "specular_rotation": turn}, (0.125, 0.5)) for turn in (0.25, 0.75)),
         ("standard_surface", {**ROUGH_METAL, "specular_rotation": 0.1}, (0.5, 0.125)),
         ("open_pbr_surface", OPEN_METAL, (OPEN_WIDTH, OPEN_WIDTH / 2)),
         ("gltf_pbr", {**GLTF_METAL, "anisotropy_strength": 0.5}, (0.25 + 0.75 * 0.25, 0.25)),
