@@ -92,7 +92,7 @@ class ShapeReader:
                 else:
                     cage = replace(cage, holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
             shape = ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, shown_faces=shown, rate=rate)
-            shapes.append(self._completed(prim, shape))
+            shapes.append(self._completed(prim, shape, cages[names]))
         return shapes
 
     def _materials_of_faces(
@@ -124,22 +124,22 @@ class ShapeReader:
             self._notes.add(what, material.name)
         return tuple(sorted(material.primvars())), next(iter(names), None)
 
-    def _completed(self, prim: Usd.Prim, shape: ShapeContents) -> ShapeContents:
-        """A shape with its texture coordinates, constant primvars and emission."""
+    def _completed(self, prim: Usd.Prim, shape: ShapeContents, whole: CageContents | None = None) -> ShapeContents:
+        """A shape with its texture coordinates, constant primvars and emission, that of a part of a whole cage."""
         cage, material = shape.cage, shape.material
         for name, fallback in [] if material is None else [*material.texcoords().items()][:1]:
             cage = self._with_texcoords(prim, cage, name, fallback)
         names = COLORS if material is None else material.primvars()
         constants = {name: self._constant(prim, name) for name in names if name not in cage.attributes}
         constants = {name: values for name, values in constants.items() if values}
-        radiance, is_normalized = None, False
+        radiance, whole_light = None, None
         if prim.HasAPI(UsdLux.MeshLightAPI):
-            is_normalized = bool(value_at(UsdLux.LightAPI(prim).GetNormalizeAttr(), self._time))
+            whole_light = (whole or cage) if value_at(UsdLux.LightAPI(prim).GetNormalizeAttr(), self._time) else None
             radiance = read_emission(prim, self._time).tolist()
             if not np.isfinite(radiance).all():
                 self._notes.add("mesh lights with numbers that are not finite are ignored", prim.GetPath())
                 radiance = None
-        return replace(shape, cage=cage, constants=constants, radiance=radiance, is_normalized=is_normalized)
+        return replace(shape, cage=cage, constants=constants, radiance=radiance, whole_light=whole_light)
 
     def _with_texcoords(self, prim: Usd.Prim, cage: CageContents, name: str, fallback: Input | None) -> CageContents:
         """A cage with the named texture coordinates, or else with others of its own or the fallback."""

@@ -659,8 +659,15 @@ def mesh_light(*body):
     return lamp, 50 / 6 * np.pi * rect_form_factor(1.5, 1, 4)
 
 
+# A square in two polygons, the first of which has a material of its own.
+HALVES = f"""{POLYGONS}
+    point3f[] points = [(-1,-1,0), (0.5,-1,0), (1,-1,0), (1,1,0), (0.5,1,0), (-1,1,0)]
+    int[] faceVertexCounts = [4, 4]
+    int[] faceVertexIndices = [0,1,4,5, 1,2,3,4]
+{subset([0])}"""
 LIGHTS = {
     "mesh": mesh_light(SQUARE),
+    "mesh of two materials": (mesh_light(HALVES)[0] + material(""), mesh_light(HALVES)[1]),
     "subdivided mesh": mesh_light(SMOOTH_SQUARE),
     "point of a sphere without a radius": (light("SphereLight", NORMALIZED, radius=0, intensity=100), 25 / 16),
     "rect": (light("RectLight", width=2, height=3, intensity=5), 5 * np.pi * rect_form_factor(1, 1.5, 4)),
