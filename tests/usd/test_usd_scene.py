@@ -1042,6 +1042,21 @@ def test_display_colours_of_every_interpolation(scene, scheme):
         np.testing.assert_allclose(picture[6:10, [4, 11]].mean(axis=0), expected, atol=0.07)
 
 
+@pytest.mark.parametrize("interpolation", ["vertex", "faceVarying", "constant"])
+@pytest.mark.parametrize(("name", "kind"), [("displayColor", ""), ("paint", "float3"), ("paint", "float4")])
+def test_colours_with_alpha_are_colours(stage, name, kind, interpolation):
+    """Blender's attributes of colours have four numbers, and Mitsuba's one or three."""
+    values = f"{[(1, 0.5, 0.25, 0.5)] * (1 if interpolation == 'constant' else 4)}"
+    square = SQUARE, f'color4f[] primvars:{name} = {values} (interpolation = "{interpolation}")'
+    reader = shader("color", f"UsdPrimvarReader_{kind}", 'string inputs:varname = "paint"', f"{kind} outputs:result")
+    paint = material("color3f inputs:diffuseColor.connect = </paint/color.outputs:result>", reader) if kind else ""
+    path = stage(CAMERA + SKY + mesh("square", *square, bound() if kind else "") + paint)
+    entries, messages = told(msub.usd_scene, path, mi, size=(4, 4))
+    assert messages[0].endswith(f"alpha of colours is ignored; expected a primvar of its own (/square.primvars:{name})")
+    picture = rendered(entries, 256).mean(axis=(0, 1))
+    np.testing.assert_allclose(picture / picture[0], [1, 0.5, 0.25], atol=0.08)  # With white reflections
+
+
 def test_polygons_have_their_normals_and_holes(scene):
     """Facets, unless normals are authored; those of left-handed meshes stay at their corners."""
     assert not scene(mesh("square", SQUARE))["square"].has_vertex_normals()
