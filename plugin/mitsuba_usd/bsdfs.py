@@ -105,7 +105,7 @@ class _Surface:
     def _color(self, given: Input) -> SceneNode:
         value = self._for_shape(given)
         if isinstance(value, PrimvarContents):
-            return _attribute(value)
+            return self._attribute(value, {1: "one number", 3: "a colour"}) or rgb(value.fallback)
         if isinstance(value, (TextureContents, NodeContents)):
             return self._textures.color(value)
         if np.min(value) < 0 or np.max(value) > 1:
@@ -147,8 +147,16 @@ class _Surface:
             return self._loadable(given, mi.Texture) or 0.0
         value = self._for_shape(given)
         if isinstance(value, PrimvarContents):
-            return _attribute(value)
+            return self._attribute(value, {1: "one number"}) or value.fallback[0]
         return self._textures.number(value) if isinstance(value, (TextureContents, NodeContents)) else _first(value)
+
+    def _attribute(self, given: PrimvarContents, widths: dict[int, str]) -> SceneNode | None:
+        """The attribute of a primvar; None if it has another width."""
+        if self._shape.cage.attributes[given.name].values.shape[1] in widths:
+            return {"type": "mesh_attribute", "name": f"vertex_{given.name}"}
+        what = f'the primvar "{given.name}" is ignored, and its fallback is used'
+        self._notes.add(f"{what}; expected {' or '.join(widths.values())} per value", self._shape.name)
+        return None
 
     def _mean(self, name: str) -> NDArray[np.float64]:
         value = self._for_shape(self._inputs[name])
@@ -327,10 +335,6 @@ def _index(reflectance: float) -> float:
     """Index of refraction above 1 with a reflectance at normal incidence."""
     root = np.sqrt(np.clip(reflectance, 0, 0.998))
     return float((1 + root) / (1 - root))
-
-
-def _attribute(given: PrimvarContents) -> SceneNode:
-    return {"type": "mesh_attribute", "name": f"vertex_{given.name}"}
 
 
 def rgb(value: ArrayLike) -> SceneNode:

@@ -128,7 +128,7 @@ class ShapeContents:
     material: MaterialContents | None = None  # The same object for equal materials
     constants: dict[str, list[float]] = field(default_factory=dict)  # Primvars with one value for the whole mesh
     radiance: list[float] | None = None  # RGB of a mesh light
-    is_normalized: bool = False  # Whether the radiance is to be divided by the area of the mesh
+    whole_light: CageContents | None = None  # All faces of a normalized mesh light, whose area divides the radiance
     # (n,) int: faces with this material, of a limit surface that is evaluated whole; None for all. Parts of polygon
     # meshes and of large surfaces have the other faces as holes.
     shown_faces: NDArray | None = None

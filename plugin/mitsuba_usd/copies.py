@@ -74,7 +74,7 @@ def with_copies(
             needed[shape] = rates.get(shape, np.ones(len(placements[shape]), np.int64))
     of_cage: dict[tuple[int, int], list[ShapeContents]] = {}
     for shape in contents.shapes:
-        if len(shape.cage.face_sizes) < LARGE and not shape.is_displaced:
+        if len(shape.cage.face_sizes) < LARGE and not shape.is_displaced and shape.whole_light is None:
             of_cage.setdefault((id(shape.cage), id(shape.shown_faces)), []).append(shape)
     together: set[ShapeContents] = set()
     for alike in of_cage.values():

@@ -198,8 +198,4 @@ def _displacement(shape: ShapeContents, textures: Textures, notes: StageWarnings
         return {_CONSTANT: mi.TensorXf(values), "displacement": _CONSTANT} if given * scale else {}
     if given["type"] != "mesh_attribute":
         return {"displacement": given}
-    name = given["name"].removeprefix("vertex_")
-    if shape.cage.attributes[name].values.shape[1] != 1:
-        notes.add(f'displacement by the primvar "{name}" is ignored; expected one number per value', shape.name)
-        return {}
     return {"displacement": given["name"], "displacement_scale": scale}

@@ -35,7 +35,7 @@ def scaled(contents: SceneContents, factor: float) -> SceneContents:
         return materials.get(material, material)
 
     def of_shape(shape: ShapeContents, matrix: np.ndarray) -> ShapeContents:
-        power = factor**2 if shape.is_normalized else 1.0
+        power = factor**2 if shape.whole_light else 1.0
         radiance = None if shape.radiance is None else [power * channel for channel in shape.radiance]
         return replace(shape, to_world=matrix @ shape.to_world, material=of_material(shape.material), radiance=radiance)
 

@@ -222,9 +222,9 @@ def subdivision(
 
 def _light_area(shape: ShapeContents) -> float:
     """Area of a normalized mesh light in the world, with all its faces; 1 for other lights."""
-    if not shape.is_normalized:
+    if (cage := shape.whole_light) is None:
         return 1.0
-    cage = replace(shape.cage, positions=points_at(np.asarray(shape.cage.positions, np.float64), shape.to_world))
+    cage = replace(cage, positions=points_at(np.asarray(cage.positions, np.float64), shape.to_world))
     if cage.scheme is not None:
         return LimitSurface(cage_of(cage)).area()
     corners, face = triangle_corners(cage.positions, cage.face_sizes, cage.face_vertices)

@@ -27,6 +27,7 @@ MOST_SHARED_FACES = 1_000_000  # Most faces times parts of a mesh whose parts ea
 AROUND, ALONG = 64, 24  # Segments of spheres and the like: of a circle around the axis, and of half a circle along it
 # Even permutations of the coordinates that take z to an axis.
 _TURNS = {"X": (2, 0, 1), "Y": (1, 2, 0), "Z": (0, 1, 2)}
+_ALPHA = "alpha of colours is ignored; expected a primvar of its own"
 _NO_FACES: IntArray = np.zeros(0, np.int64)
 # Points and normals along the profile of a surface of revolution, as (distance, z).
 Line = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -56,6 +57,7 @@ class ShapeReader:
                     what = "textures of curves are looked up around them, and along all curves of a prim"
                     self._notes.add(what, prim.GetPath())
                 cage, curves = read_curves(prim, to_world, self._time, names, self._notes)
+                cage = self._without_alpha(prim, cage)
                 return [self._completed(prim, ShapeContents(path, cage, to_world, None, material, curves=curves))]
             cage, normals = read_gprim(prim, self._time)
             return [self._completed(prim, ShapeContents(path, cage, to_world, normals, material))]
@@ -81,7 +83,7 @@ class ShapeReader:
                 continue
             names = self._primvars(material)
             if names not in cages:
-                cages[names] = reader.contents(*names)
+                cages[names] = self._without_alpha(prim, reader.contents(*names))
             cage = cages[names]
             normals = reader.normals(cage) if cage.scheme is None else None
             shown = None
@@ -92,7 +94,7 @@ class ShapeReader:
                 else:
                     cage = replace(cage, holes=np.union1d(cage.holes, np.flatnonzero(owner != number)))
             shape = ShapeContents(str(prim.GetPath()), cage, to_world, normals, material, shown_faces=shown, rate=rate)
-            shapes.append(self._completed(prim, shape))
+            shapes.append(self._completed(prim, shape, cages[names]))
         return shapes
 
     def _materials_of_faces(
@@ -124,22 +126,30 @@ class ShapeReader:
             self._notes.add(what, material.name)
         return tuple(sorted(material.primvars())), next(iter(names), None)
 
-    def _completed(self, prim: Usd.Prim, shape: ShapeContents) -> ShapeContents:
-        """A shape with its texture coordinates, constant primvars and emission."""
+    def _without_alpha(self, prim: Usd.Prim, cage: CageContents) -> CageContents:
+        """A cage with colours of three numbers, as Mitsuba's attributes have one or three."""
+        wide = [name for name, attribute in cage.attributes.items() if attribute.values.shape[1] == 4]
+        for name in wide:
+            self._notes.add(_ALPHA, prim.GetPath().AppendProperty(f"primvars:{name}"))
+        colors = {name: replace(cage.attributes[name], values=cage.attributes[name].values[:, :3]) for name in wide}
+        return replace(cage, attributes={**cage.attributes, **colors}) if wide else cage
+
+    def _completed(self, prim: Usd.Prim, shape: ShapeContents, whole: CageContents | None = None) -> ShapeContents:
+        """A shape with its texture coordinates, constant primvars and emission, that of a part of a whole cage."""
         cage, material = shape.cage, shape.material
         for name, fallback in [] if material is None else [*material.texcoords().items()][:1]:
             cage = self._with_texcoords(prim, cage, name, fallback)
         names = COLORS if material is None else material.primvars()
         constants = {name: self._constant(prim, name) for name in names if name not in cage.attributes}
         constants = {name: values for name, values in constants.items() if values}
-        radiance, is_normalized = None, False
+        radiance, whole_light = None, None
         if prim.HasAPI(UsdLux.MeshLightAPI):
-            is_normalized = bool(value_at(UsdLux.LightAPI(prim).GetNormalizeAttr(), self._time))
+            whole_light = (whole or cage) if value_at(UsdLux.LightAPI(prim).GetNormalizeAttr(), self._time) else None
             radiance = read_emission(prim, self._time).tolist()
             if not np.isfinite(radiance).all():
                 self._notes.add("mesh lights with numbers that are not finite are ignored", prim.GetPath())
                 radiance = None
-        return replace(shape, cage=cage, constants=constants, radiance=radiance, is_normalized=is_normalized)
+        return replace(shape, cage=cage, constants=constants, radiance=radiance, whole_light=whole_light)
 
     def _with_texcoords(self, prim: Usd.Prim, cage: CageContents, name: str, fallback: Input | None) -> CageContents:
         """A cage with the named texture coordinates, or else with others of its own or the fallback."""
@@ -154,7 +164,7 @@ class ShapeReader:
         return cage
 
     def _constant(self, prim: Usd.Prim, name: str) -> list[float]:
-        """Value of a constant primvar of a prim or its ancestors, of one or three numbers; else nothing."""
+        """Value of a constant primvar of a prim or its ancestors, of one, three or four numbers; else nothing."""
         primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
         if not primvar or not primvar.HasValue() or primvar.GetInterpolation() != UsdGeom.Tokens.constant:
             return []
@@ -162,9 +172,11 @@ class ShapeReader:
         if primvar.IsIndexed() and values.ndim:
             indices = np.asarray(value_at(primvar.GetIndicesAttr(), self._time))
             values = values[indices] if ((indices >= 0) & (indices < len(values))).all() else np.zeros(0)
-        if values.dtype.kind == "f" and values.size in (1, 3) and np.isfinite(values).all():
-            return values.astype(np.float64).ravel().tolist()
-        what = "constant primvars are ignored unless they have one value of one or three finite numbers"
+        if values.dtype.kind == "f" and values.size in (1, 3, 4) and np.isfinite(values).all():
+            if values.size == 4:
+                self._notes.add(_ALPHA, primvar.GetAttr().GetPath())
+            return values.astype(np.float64).ravel()[:3].tolist()
+        what = "constant primvars are ignored unless they have one value of one, three or four finite numbers"
         self._notes.add(what, primvar.GetAttr().GetPath())
         return []
 

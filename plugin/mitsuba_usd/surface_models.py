@@ -318,6 +318,7 @@ def with_shape(given: Input, values: Mapping[str, list[float]]) -> Input:
     """An expression with the constant primvars of a mesh as numbers."""
     if isinstance(given, PrimvarContents):
         value = values.get(given.name, given.fallback)
+        value = (value + given.fallback[3:] if len(value) == 3 else value)[: len(given.fallback)]
         return value[0] if len(value) == 1 else value
     if not isinstance(given, NodeContents) or given.category == "texcoord":
         return given

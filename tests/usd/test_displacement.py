@@ -102,7 +102,7 @@ def test_ignored_displacements_warn(tmp_path, variant_scalar_rgb):  # noqa: ARG0
     for text, body, expected in (
         (paint(f"{HEIGHT} = 1"), SQUARE, "displacement of meshes that are not subdivided is ignored (/sheet)"),
         (paint(f"{HEIGHT} = 1", output="outputs:other"), SHEET, "no connected outputs:displacement (/paint)"),
-        (paint(HEIGHTS, READER), SHEET + pairs, 'the primvar "h" is ignored; expected one number per value (/sheet)'),
+        (paint(HEIGHTS, READER), SHEET + pairs, "its fallback is used; expected one number per value (/sheet)"),
     ):
         _, (message,) = told(msub.usd_scene, stages.write(tmp_path, text + mesh("sheet", body, bound())), mi)
         assert message.endswith(expected)

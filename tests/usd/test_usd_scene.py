@@ -659,8 +659,15 @@ def mesh_light(*body):
     return lamp, 50 / 6 * np.pi * rect_form_factor(1.5, 1, 4)
 
 
+# A square in two polygons, the first of which has a material of its own.
+HALVES = f"""{POLYGONS}
+    point3f[] points = [(-1,-1,0), (0.5,-1,0), (1,-1,0), (1,1,0), (0.5,1,0), (-1,1,0)]
+    int[] faceVertexCounts = [4, 4]
+    int[] faceVertexIndices = [0,1,4,5, 1,2,3,4]
+{subset([0])}"""
 LIGHTS = {
     "mesh": mesh_light(SQUARE),
+    "mesh of two materials": (mesh_light(HALVES)[0] + material(""), mesh_light(HALVES)[1]),
     "subdivided mesh": mesh_light(SMOOTH_SQUARE),
     "point of a sphere without a radius": (light("SphereLight", NORMALIZED, radius=0, intensity=100), 25 / 16),
     "rect": (light("RectLight", width=2, height=3, intensity=5), 5 * np.pi * rect_form_factor(1, 1.5, 4)),
@@ -1033,6 +1040,21 @@ def test_display_colours_of_every_interpolation(scene, scheme):
         picture = rendered(scene(CAMERA + SKY + mesh("strip", strip, body), size=(16, 16)), 64)
         # Rows in the middle, and columns in the middle of either square.
         np.testing.assert_allclose(picture[6:10, [4, 11]].mean(axis=0), expected, atol=0.07)
+
+
+@pytest.mark.parametrize("interpolation", ["vertex", "faceVarying", "constant"])
+@pytest.mark.parametrize(("name", "kind"), [("displayColor", ""), ("paint", "float3"), ("paint", "float4")])
+def test_colours_with_alpha_are_colours(stage, name, kind, interpolation):
+    """Blender's attributes of colours have four numbers, and Mitsuba's one or three."""
+    values = f"{[(1, 0.5, 0.25, 0.5)] * (1 if interpolation == 'constant' else 4)}"
+    square = SQUARE, f'color4f[] primvars:{name} = {values} (interpolation = "{interpolation}")'
+    reader = shader("color", f"UsdPrimvarReader_{kind}", 'string inputs:varname = "paint"', f"{kind} outputs:result")
+    paint = material("color3f inputs:diffuseColor.connect = </paint/color.outputs:result>", reader) if kind else ""
+    path = stage(CAMERA + SKY + mesh("square", *square, bound() if kind else "") + paint)
+    entries, messages = told(msub.usd_scene, path, mi, size=(4, 4))
+    assert messages[0].endswith(f"alpha of colours is ignored; expected a primvar of its own (/square.primvars:{name})")
+    picture = rendered(entries, 256).mean(axis=(0, 1))
+    np.testing.assert_allclose(picture / picture[0], [1, 0.5, 0.25], atol=0.08)  # With white reflections
 
 
 def test_polygons_have_their_normals_and_holes(scene):
