@@ -299,14 +299,14 @@ def usd_scene(
     texture_size: int | None = None,
     transparent: bool = False,
     over: str | Path | None = None,
+    weigh_lights: bool = False,
     **parameters: Any,
 ) -> SceneNode:
     """A whole USD file as a dictionary for ``mi.load_dict``.
 
     Meshes become limit surfaces, or polygons without a subdivision scheme; with their transforms, instances, materials,
     lights and the camera. A stage without lights or a camera gets those of the studio. Lengths are those of the stage:
-    below 0.01 units, Mitsuba's shadows leak, which `render` avoids by a larger scene. With many lights,
-    `mitsuba_subdivision.weigh_lights` makes the loaded scene sample each by its contribution to the picture.
+    below 0.01 units, Mitsuba's shadows leak, which `render` avoids by a larger scene.
 
     Parameters
     ----------
@@ -331,6 +331,9 @@ def usd_scene(
         meshes, but no environment, no lamps and no backdrop.
     over : str or Path, optional
         A USD layer that is stronger than the file: materials, lights, cameras, visibility.
+    weigh_lights : bool
+        Whether each light is sampled by what it gives to the picture, as by `mitsuba_subdivision.weigh_lights`. The
+        scene is loaded once for that.
     **parameters
         Of every shape ``subdivision``, such as ``tessellation_rate=4`` or ``shading="vertex"``. By default shading is
         that of ``shading="auto"``, and triangles are as few as the picture needs, about 4 million at most. With exact
@@ -369,4 +372,5 @@ def usd_scene(
     with variant_set(mi):
         look = studio.Look(view, size, spp, texture_size=texture_size, transparent=transparent)
         source = StageScenes(path, look, parameters, time=time, camera=camera, over=over)
-        return with_meshes(studio.StillPicture(source).scene)
+        scene = with_meshes(studio.StillPicture(source).scene)
+        return studio.with_light_weights(scene) if weigh_lights else scene

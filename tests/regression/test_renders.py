@@ -2,6 +2,7 @@ import itertools
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 from unittest.mock import Mock
 
@@ -17,8 +18,9 @@ from mitsuba_subdivision.regression import scene as scenes
 from mitsuba_subdivision.regression.image import Estimate, combine, load_image, read_channels, save_image
 from mitsuba_subdivision.regression.renders import Sampling, merge_passes, render_like, render_pass
 from mitsuba_subdivision.regression.scene import LEAST_PART_SPP, PART_SAMPLES, load_scene, parts_of, render_image
+from mitsuba_subdivision.regression.tiers import Status
 from regression.defects import SCENES
-from regression.random_images import BATCH, SPREAD, estimate, truth
+from regression.random_images import BATCH, METADATA, SPREAD, estimate, random_image, truth
 
 SCENE = SCENES / "valence3.xml"
 SAMPLING, SIZE = Sampling(12, 8, seed=5), 16
@@ -65,6 +67,30 @@ def test_merging_by_steps_counts_all_batches_and_keeps_the_probe(loaded):
     assert merged.metadata["sampling"]["batches"] == [[0, 12]]
     assert np.array_equal(merged.paired, passes[0].paired)
     assert merged.metadata["paired"] == {"seed": 5, "spp": 8}
+
+
+def test_on_another_machine_all_samples_decide_even_where_a_second_attempt_passes(monkeypatch, np_rng):
+    """The first attempt has a bright tile by chance; only the samples of the reference show a change of 3 %."""
+    bright = np.ones((32, 32, 1))
+    bright[8:12, 8:12] = 1.3
+    sampling = {"seed": 0, "batch": BATCH, "batches": [[0, 400]], "total": 400}
+    metadata = {**METADATA, "sampling": sampling, "channels": ["R", "G", "B"], "sensors": 1}
+    reference = random_image(np_rng, 400, metadata=metadata)
+    here = {**metadata, "environment": {"processor": "b"}}
+    own = reference.pixels * np.where(bright > 1, 1.03, 1)
+    same = {"estimate": replace(reference.estimate, mean=own), "paired": 1.00002 * reference.paired, "metadata": here}
+    other = {**same, "metadata": {**here, "sampling": {**sampling, "seed": 9, "batches": [[0, 4]], "total": 4}}}
+
+    def attempt(*_, second_attempt=False):
+        made = random_image(np_rng, 4, mean=truth() * (1 if second_attempt else bright))
+        return replace(made, paired=same["paired"], metadata=other["metadata"])
+
+    monkeypatch.setattr(renders, "render_like", attempt)
+    monkeypatch.setattr(renders, "_load_like", Mock())
+    monkeypatch.setattr(renders, "render_pass", lambda *_: replace(reference, pixels=own, **same))
+    result = renders.compare_scene(reference, "scene.xml", ["paired", "tile"])
+    assert result.status is Status.FAIL
+    assert "all samples of the reference" in result.notes[-1]
 
 
 def test_passes_of_different_images_are_refused(loaded):

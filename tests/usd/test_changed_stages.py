@@ -226,3 +226,29 @@ def test_light_weights_follow_contributions_and_keep_the_mean(tmp_path):
     # Weights that are given stay, and few lights are chosen alike.
     assert not msub.weigh_lights(scene)
     assert not msub.weigh_lights(loaded(LEAST_LIGHTS - 1))
+
+
+@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+def test_entries_of_lights_have_the_weights_of_the_loaded_scene(tmp_path):
+    """Lamps with and without a shape, a sky, and meshes that shine, subdivided or not."""
+    coordinates = f'texCoord2f[] primvars:st = [{"(0, 0), (1, 1)," * 4}] (interpolation = "vertex")'
+    shines = {"apis": ["MeshLightAPI"]}
+    lights = [
+        prim("SphereLight", "emitter", "float inputs:intensity = 30", moved(translate=(3, -3, 4))),
+        prim("DistantLight", "sun", "float inputs:intensity = 0.3"),
+        prim("Mesh", "glow", CUBE, coordinates, "float inputs:intensity = 2", moved(translate=(-2.6, 0, 0)), **shines),
+        prim("Mesh", "panel", SQUARE, "float inputs:intensity = 4", moved(translate=(0, 0, 3)), **shines),
+    ]
+    floor = prim("Mesh", "floor", SQUARE, moved(scale=(9, 9, 1)))
+    path = write(tmp_path, floor + DULL_SKY + "".join(lights) + CAMERA)
+    scenes = []
+    for weighs in (False, True):
+        # Loading takes the tensor out of its dictionary.
+        bitmap = {"type": "bitmap", "raw": True, "data": mi.TensorXf(np.full((2, 2, 1), 0.01, np.float32))}
+        entries = msub.usd_scene(path, mi, size=(16, 12), weigh_lights=weighs, displacement=bitmap, **RATE)
+        scenes.append(load_scene(entries, None, "box").scene)
+    assert msub.weigh_lights(scenes[0])
+    expected, given = ([float(mi.traverse(e)["sampling_weight"]) for e in s.emitters()] for s in scenes)
+    assert len(expected) == 5
+    assert given == expected
+    np.testing.assert_array_equal(*(np.array(mi.render(scene, spp=16, seed=1)) for scene in scenes))

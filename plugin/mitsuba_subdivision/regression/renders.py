@@ -311,8 +311,8 @@ def compare_scene(
     """Render a scene as its reference was, in the current variant, and `compare` the two.
 
     Where only the tile tier fails, chance may be the reason. A second attempt with new samples, four times as many,
-    then decides. Where the paired tier warns, as on another machine, and no tier fails, the tile tier decides by all
-    samples of the reference, which leave nearly no noise: it sees what the paired tier would have seen.
+    then decides. Where the paired tier warns, as on another machine, and still no tier fails, the tile tier decides by
+    all samples of the reference, which leave nearly no noise: it sees what the paired tier would have seen.
     """
     test = render_like(reference, source, spp, seed)
 
@@ -323,13 +323,13 @@ def compare_scene(
 
     comparison = compared(test)
     failed = [tier for tier in comparison.tiers if tier.status is Status.FAIL]
-    paired = comparison.tier("paired")
-    if not failed and paired and paired.status is Status.WARN:
-        comparison = compared(render_pass(_load_like(reference, source), sampling_of(reference)))
-        comparison.notes.append("the tile tier compared all samples of the reference, as the paired tier warns")
-    elif [tier.name for tier in failed] == ["tile"] and test.estimate is not None:
+    if [tier.name for tier in failed] == ["tile"] and test.estimate is not None:
         count = RETRY_FACTOR * int(test.estimate.count.max())
         comparison = compared(render_like(reference, source, count, seed, second_attempt=True))
         what = f"second attempt of the tile tier, with {RETRY_FACTOR} times the samples; the first found"
         comparison.notes.append(f"{what}: {failed[0].lines[0]}")
+    paired = comparison.tier("paired")
+    if comparison.status is not Status.FAIL and paired and paired.status is Status.WARN:
+        comparison = compared(render_pass(_load_like(reference, source), sampling_of(reference)))
+        comparison.notes.append("the tile tier compared all samples of the reference, as the paired tier warns")
     return comparison

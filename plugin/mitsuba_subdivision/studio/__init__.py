@@ -16,6 +16,7 @@ from .picture import (
     shading_for,
     triangles_for,
     weigh_lights,
+    with_light_weights,
 )
 from .studio_entries import (
     AOVS,
@@ -38,5 +39,5 @@ __all__ = [
     "MOST_TRIANGLES", "STUDIO", "LoadedScene", "Look", "SceneSource", "StillPicture", "View", "enlargement", "finished",
     "frame_table", "highest_rate", "load_quietly", "outline_for", "pixels_of_boxes", "render_denoised", "sampler",
     "segments_for", "set_parameters", "shading_for", "studio", "studio_scene", "triangles_for", "variant_in_use",
-    "weigh_lights",
+    "weigh_lights", "with_light_weights",
 ]  # fmt: skip

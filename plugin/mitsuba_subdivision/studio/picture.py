@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -16,6 +17,7 @@ from ..shapes.interaction_hook import exact_shading_problem
 from ..shapes.parameter_table import SHADINGS
 from ..shapes.parameters import pixel_error_for
 from ..variants import SceneNode
+from .animation import load_quietly
 from .studio_entries import variant_in_use
 
 # Largest distance of triangles from the surface in pixels, by shading. With exact shading, only silhouettes show it.
@@ -172,6 +174,30 @@ def weigh_lights(scene: mi.Scene, sensor: int = 0) -> bool:
     pays = bool(np.square(seen).mean() > LEAST_UNEVEN * seen.mean() ** 2)
     set_weights(np.maximum(seen / seen.sum(), LEAST_WEIGHT) if pays else np.array(before))
     return pays
+
+
+def with_light_weights(scene: SceneNode) -> SceneNode:
+    """Entries of a scene whose lights have the weights that `weigh_lights` gives to those of the loaded scene.
+
+    Objects among the entries are changed themselves.
+    """
+    loaded = load_quietly(_copied(scene)).scene
+    result = dict(scene)
+    for light in loaded.emitters() if weigh_lights(loaded) else ():
+        weight = {"sampling_weight": float(np.ravel(np.array(mi.traverse(light)["sampling_weight"]))[0])}
+        shape = light.get_shape()
+        name = light.id() if shape is None else shape.id()
+        entry = result.get(name)
+        if isinstance(entry, dict):
+            result[name] = {**entry, **(weight if shape is None else {"emitter": {**entry["emitter"], **weight}})}
+    return result
+
+
+def _copied(entry: Any) -> Any:
+    """An entry with other tensors, as `mi.load_dict` takes those of bitmaps out of their dictionaries."""
+    if isinstance(entry, dict):
+        return {name: _copied(part) for name, part in entry.items()}
+    return mi.TensorXf(entry) if isinstance(entry, mi.TensorXf) else entry
 
 
 def require_denoiser() -> None:
