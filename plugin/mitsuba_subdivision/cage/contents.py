@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -137,11 +138,11 @@ class CageContents:
     face_sizes: IntArray  # (n_f,) int: number of vertices of each face
     face_vertices: NDArray  # (n_h,) int: 0-based vertices of all faces, face by face
     # (n, 3) float64: rows (vertex, vertex, sharpness), one for each sharp edge
-    creases: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    creases: NDArray[np.float64] = field(default_factory=partial(np.zeros, (0, 3)))
     # (n, 2) float64: rows (vertex, sharpness), one for each sharp vertex
-    corners: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    corners: NDArray[np.float64] = field(default_factory=partial(np.zeros, (0, 2)))
     # (n,) int: 0-based faces that are not part of the surface
-    holes: IntArray = field(default_factory=lambda: np.zeros(0, np.int64))
+    holes: IntArray = field(default_factory=partial(np.arange, 0))
     texcoords: Attribute | None = None
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
     # (n,) int: 0-based faces of each material, by name

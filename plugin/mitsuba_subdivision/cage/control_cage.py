@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,7 +18,10 @@ from ..variants import variant_module
 from .contents import RULES, Attribute, CageContents, shape_properties, validated_attribute
 from .errors import CageError, CageSource
 from .validation import (
+    FlatFaces,
     flattened_faces,
+    require_names,
+    require_rules,
     validated_face_indices,
     validated_faces,
     validated_holes,
@@ -156,33 +159,15 @@ class ControlCage:
         source = source or CageSource()
         if not isinstance(strict, (bool, np.bool_)):
             raise CageError(f"{source.name}: strict is {strict!r}; expected True or False")
-        sizes, vertices = faces if isinstance(faces, _FlatFaces) else flattened_faces(faces, source)
-        rules: dict[str, Any] = {
-            "boundary": boundary,
-            "crease_method": crease_method,
-            "triangle_rule": triangle_rule,
-            "face_varying": face_varying,
-        }
-        for name, rule in rules.items():
-            if rule not in RULES[name]:
-                raise CageError(f'{source.name}: {name} "{rule}"; expected one of {", ".join(RULES[name])}')
+        sizes, vertices = flattened_faces(faces, source)
+        rules: dict[str, Any] = dict(zip(RULES, (boundary, crease_method, triangle_rule, face_varying), strict=True))
+        require_rules(rules, source)
         attributes = {} if attributes is None else attributes
-        if not isinstance(attributes, Mapping):
-            raise CageError(f"{source.name}: attributes are {attributes!r}; expected a dict of attributes by name")
-        if "texcoords" in attributes:
-            raise CageError(
-                f'{source.name}: an attribute is called "texcoords"; expected another name, as texture coordinates are '
-                "given apart from attributes"
-            )
+        require_names(attributes, source)
         validated = validated_positions(positions, source)
         topology, non_manifold, order = validated_faces(len(validated), sizes, vertices, source, strict)
-        structure = SharpMesh(
-            topology=topology,
-            non_manifold=non_manifold,
-            tags=validated_tags(topology, creases, corners, source),
-            holes=validated_holes(topology, holes, source),
-            **rules,
-        ).shared()
+        tags, holes = validated_tags(topology, creases, corners, source), validated_holes(topology, holes, source)
+        structure = SharpMesh(topology, non_manifold, tags, **rules, holes=holes).shared()
         topology = structure.topology
 
         def checked(given: Attribute | ArrayLike, name: str, width: int | None = None) -> Attribute:
@@ -225,7 +210,7 @@ class ControlCage:
         CageError
             As the constructor, or if ``face_sizes`` do not add up to the length of ``face_vertices``.
         """
-        return cls(positions, _FlatFaces(np.asarray(face_sizes), np.asarray(face_vertices)), **options)
+        return cls(positions, FlatFaces(np.asarray(face_sizes), np.asarray(face_vertices)), **options)
 
     @classmethod
     def from_file(
@@ -411,13 +396,7 @@ class ControlCage:
         The diagonal has the number of neighbours of each vertex, and neighbours have -1. The matrix is symmetric and
         positive semi-definite; constants are in its null space. `LimitSurface.stiffness` respects lengths and angles.
         """
-        from scipy import sparse
-
-        start, end = self.edges[self.edges[:, 0] != self.edges[:, 1]].T
-        rows, columns = np.concatenate([start, end]), np.concatenate([end, start])
-        shape = self.vertex_count, self.vertex_count
-        adjacency = sparse.coo_array((np.ones(len(rows)), (rows, columns)), shape=shape).tocsr()
-        return sparse.csr_array(sparse.diags_array(adjacency.sum(axis=1)) - adjacency)
+        return self.topology.laplacian()
 
     @property
     def contents(self) -> CageContents:
@@ -463,13 +442,6 @@ class ControlCage:
 
     def __repr__(self) -> str:
         return f"ControlCage({self.source.name}, {self.vertex_count} vertices, {self.face_count} faces)"
-
-
-class _FlatFaces(NamedTuple):
-    """Faces as flat arrays, passed by `ControlCage.from_arrays` to the constructor."""
-
-    sizes: NDArray
-    vertices: NDArray
 
 
 def cage_of(contents: CageContents, **options: Any) -> ControlCage:

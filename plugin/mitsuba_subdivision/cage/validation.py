@@ -5,9 +5,9 @@ Every error names the first invalid value, the number of invalid values, and the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import chain
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +24,7 @@ from ..mesh.manifold import (
     separated,
     turning_order,
 )
+from .contents import RULES
 from .errors import CageError, CageSource, in_digits, number_of, number_of_such, warn
 
 # Vertices and half-edges of the cage, and of the cage refined once, must fit into 31 bits.
@@ -53,8 +54,35 @@ def validated_positions(positions: ArrayLike, source: CageSource) -> NDArray[np.
     return read_only(copy)
 
 
+def require_rules(rules: Mapping[str, str], source: CageSource) -> None:
+    """Raise CageError if a rule has none of its values in `RULES`."""
+    for name, rule in rules.items():
+        if rule not in RULES[name]:
+            raise CageError(f'{source.name}: {name} "{rule}"; expected one of {", ".join(RULES[name])}')
+
+
+def require_names(attributes: object, source: CageSource) -> None:
+    """Raise CageError unless attributes are given by their names, none of which is that of texture coordinates."""
+    if not isinstance(attributes, Mapping):
+        raise CageError(f"{source.name}: attributes are {attributes!r}; expected a dict of attributes by name")
+    if "texcoords" in attributes:
+        raise CageError(
+            f'{source.name}: an attribute is called "texcoords"; expected another name, as texture coordinates are '
+            "given apart from attributes"
+        )
+
+
+class FlatFaces(NamedTuple):
+    """Faces as flat arrays, passed by `ControlCage.from_arrays` to the constructor."""
+
+    sizes: NDArray
+    vertices: NDArray
+
+
 def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSource) -> tuple[NDArray, NDArray]:
     """Return sizes and concatenated vertices of faces, not yet validated."""
+    if isinstance(faces, FlatFaces):
+        return faces
     if hasattr(faces, "__array__"):
         table = np.asarray(faces)
         if table.ndim != 2:

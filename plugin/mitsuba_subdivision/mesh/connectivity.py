@@ -9,13 +9,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import ragged
 from .ragged import IntArray, first_indices, sorted_order
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 # Indices of half-edges, faces and edges. int32 halves the memory, and on large cages the time.
 IndexArray = NDArray[np.int32]
@@ -244,6 +247,16 @@ class Topology:
         ends = np.stack(np.divmod(keys, self.vertex_count)[::-1], axis=1).astype(np.int32)
         ends.flags.writeable = False
         return ends
+
+    def laplacian(self) -> sparse.csr_array:
+        """Return the uniform Laplacian of the edges: ``(n_v, n_v)``, with the degrees on the diagonal."""
+        from scipy import sparse
+
+        start, end = self.edge_ends[self.edge_ends[:, 0] != self.edge_ends[:, 1]].T
+        rows, columns = np.concatenate([start, end]), np.concatenate([end, start])
+        shape = self.vertex_count, self.vertex_count
+        adjacency = sparse.coo_array((np.ones(len(rows)), (rows, columns)), shape=shape).tocsr()
+        return sparse.csr_array(sparse.diags_array(adjacency.sum(axis=1)) - adjacency)
 
     @cached_property
     def vertex_half_edge(self) -> IndexArray:

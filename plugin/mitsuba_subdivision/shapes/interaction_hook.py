@@ -296,14 +296,7 @@ def _triangle(variant: Variant) -> mi.Mesh:
     class Triangle(variant.Mesh):
         """Mesh whose overrides, those of `ExactShading`, record their arguments and return known results."""
 
-        def complete(
-            self,
-            si: mi.SurfaceInteraction3f,
-            ray: mi.Ray3f,
-            preliminary: mi.PreliminaryIntersection3f,
-            flags: int,
-            active: Mask,
-        ) -> None:
+        def complete(self, si: Any, ray: Any, preliminary: Any, flags: int, active: Mask) -> None:
             self.asked = _identity(ray.o, ray.d, preliminary.t, preliminary.prim_uv, flags, active)
             si.uv = variant.Point2f(*_ANSWERED_UV)
 
