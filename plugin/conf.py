@@ -1,7 +1,7 @@
-"""Settings of Sphinx for the documentation: the guide, the pages beside the code, and the API reference.
+"""Sphinx settings of the documentation: the guide, the pages beside the code, and the API reference.
 
-Pages are written for GitHub, and read here as they are. Links to other files download them. The README lies above this
-folder; it begins the start page.
+Pages are written for GitHub. Links to other files download them. The README is above this folder, and begins the start
+page.
 """
 
 import re
@@ -21,33 +21,33 @@ exclude_patterns = ["mitsuba_subdivision", "mitsuba_usd", "reference/build", "**
 
 myst_enable_extensions = ["dollarmath", "html_image"]
 myst_fence_as_directive = ["mermaid"]
-# Deep enough for every heading that a link leads to, with GitHub's names.
+# Deep enough for all linked headings, with GitHub's names.
 myst_heading_anchors = 3
-# Notebooks are shown as they are stored; the tests run them.
+# Stored outputs of notebooks; the tests run them.
 nb_execution_mode = "off"
 
 autodoc_default_options = {"members": True, "member-order": "bysource"}
 # Types are in the docstrings, with the shapes of arrays.
 autodoc_typehints = "none"
 autodoc_preserve_defaults = True
-# Members have entries of their own.
+# Members have separate entries.
 numpydoc_show_class_members = False
-# Names between backticks are links where the reference has them.
+# Names between backticks are links if the reference has them.
 default_role = "py:obj"
 
 _TOP = Path(__file__).resolve().parents[1]
 
 
 def setup(app):
-    """Have pages and docstrings read in another way than they are written."""
+    """Adapt pages and docstrings."""
     app.connect("source-read", _from_here)
-    # Leave out what Python says of each field of a named tuple; the docstring of the class describes them.
+    # Omit Python's docstrings of the fields of named tuples; the class describes them.
     app.connect("autodoc-skip-member", _is_skipped)
     app.connect("doctree-resolved", _link_names)
 
 
 def _from_here(_app, page, source):
-    """Begin the start page with the README, and lead links to the README to the start page."""
+    """Begin the start page with the README, and redirect links to the README."""
     if page == "index":
         readme = (_TOP / "README.md").read_text(encoding="utf-8")
         readme = re.sub(r'(\]\(|src=")(?=renders/|LICENSE)', r"\1../", readme)
@@ -56,21 +56,21 @@ def _from_here(_app, page, source):
 
 
 def _is_skipped(_app, _what, _name, member, _skip, _options):
-    # None leaves it to Sphinx.
+    # None: left to Sphinx.
     return True if (member.__doc__ or "").startswith("Alias for field number") else None
 
 
 def _link_names(app, tree, page):
-    """Lead names between backticks on Markdown's pages to the API reference, where it has one of that name."""
+    """Link names between backticks on Markdown pages to the API reference, if it has them."""
     if page.startswith("reference/"):
         return
     objects = app.env.get_domain("py").objects
     for literal in list(tree.findall(nodes.literal)):
         name = literal.astext().removeprefix("msub.")
-        # Plain words of small letters are often something else: parameters, files, commands.
+        # Plain lower-case words are often parameters, files or commands.
         if isinstance(literal.parent, nodes.reference) or not re.search(r"[A-Z_.]", name):
             continue
-        # An object has a name where it is public, and one where it is defined: both lead to one place.
+        # An object has a public name and a name where it is defined, with one target.
         places = {(entry.docname, entry.node_id) for full, entry in objects.items() if f".{full}".endswith(f".{name}")}
         if len(places) == 1:
             parent, at = literal.parent, literal.parent.index(literal)

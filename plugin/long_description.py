@@ -1,8 +1,8 @@
-"""The README as package indexes show it: a hook of hatchling, by which packages are built.
+"""The README for package indexes: a metadata hook of hatchling.
 
-An index has none of the repository's files, so that relative links lead nowhere there. They become absolute, to the
-files as they are at the tag of the version, if ``[project.urls]`` in ``pyproject.toml`` has a ``Repository`` on GitHub.
-Without one, a link becomes its text, and a picture the words that stand for it.
+Relative links do not work on an index. They become absolute, to files at the tag of the version, if ``[project.urls]``
+in ``pyproject.toml`` has a ``Repository`` on GitHub. Without it, a link becomes its text, and a picture its alternative
+text.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 from hatchling.metadata.plugin.interface import MetadataHookInterface
 
-# Whether a target is relative: it has no scheme, and is no place on the same page.
+# A relative target has no scheme and is not on the same page.
 _RELATIVE = r"(?![a-z]+:|#)"
 _HTML_PICTURE = re.compile(
     rf'(?P<before><img src=")(?P<target>{_RELATIVE}[^"]+)(?P<after>"[^>]*alt="(?P<text>[^"]*)">)'
@@ -41,9 +41,9 @@ def long_description(text: str, repository: str | None, tag: str) -> str:
     text : str
         Markdown of a file at the top of the repository.
     repository : str or None
-        Address of the repository on GitHub.
+        URL of the repository on GitHub.
     tag : str
-        Version of the files that links lead to.
+        Version of the linked files.
     """
 
     def resolved(link: re.Match[str]) -> str:

@@ -1,7 +1,7 @@
 """The pytest plugin of mitsuba-subdivision: the fixture ``render_regression`` and its options.
 
-This module lies outside the package, because pytest imports its plugins in every project of an environment, and the
-package imports Mitsuba.
+This module is outside the package, as pytest imports plugins in every project of an environment, and the package
+imports Mitsuba.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def _positive(text: str) -> float:
 def render_regression(request: pytest.FixtureRequest) -> Iterator[RenderRegression]:
     """Compare a render of a scene with its reference: ``render_regression("scene.xml", parameters={..}, tiers=..)``.
 
-    If there is no reference, the test fails and says how to make one. For all arguments, see
+    If there is no reference, the test fails with the command that makes one. For all arguments, see
     `mitsuba_subdivision.regression.fixture.RenderRegression`.
     """
     from mitsuba_subdivision.regression.fixture import RenderRegression
@@ -64,7 +64,7 @@ def render_regression(request: pytest.FixtureRequest) -> Iterator[RenderRegressi
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """List what comparisons left undecided, and after an update the references that no test used."""
+    """List undecided comparisons, and after an update unused references."""
     reports = [report for kind in terminalreporter.stats.values() for report in kind]
     found = dict.fromkeys((r.nodeid, *entry) for r in reports for entry in getattr(r, "user_properties", ()))
     undecided = [f"{nodeid}: {text}" for nodeid, key, text in found if key == "render_undecided"]

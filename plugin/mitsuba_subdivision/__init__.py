@@ -11,7 +11,7 @@ from pathlib import Path
 
 from .llvm import select_llvm
 
-# Before Mitsuba loads Dr.Jit, which takes the first LLVM library it meets.
+# Before Mitsuba loads Dr.Jit, which uses the first LLVM library that it finds.
 select_llvm()
 
 from .shapes import register, register_variant  # noqa: E402, F401 - see above
@@ -20,15 +20,15 @@ register()
 
 __version__ = "0.1.0"
 
-# Modules of the public names, as the stub imports them for type checkers. Here each is imported when it is first used,
-# so that a scene without subdivision surfaces does not wait for them.
+# Modules of the public names, which the stub imports for type checkers. They are imported on first use, so that a scene
+# without subdivision surfaces does not wait for them.
 _MODULES = {
     imported.name: "." * line.level + (line.module or imported.name)
     for line in ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")).body
     if isinstance(line, ast.ImportFrom)
     for imported in line.names
 }
-# Star imports leave out the module `fit`.
+# Star imports omit the module `fit`.
 __all__ = sorted({*_MODULES, "example_file"} - {"fit"})  # noqa: PLE0605 - the stub names them
 
 
@@ -43,12 +43,12 @@ def example_file(name: str) -> str:
     Returns
     -------
     str
-        As the shape's parameter ``filename`` takes it.
+        Path for the shape's parameter ``filename``.
 
     Raises
     ------
     FileNotFoundError
-        If there is none.
+        If there is no such file.
     """
     package = Path(__file__).resolve().parent
     candidates = [package / "scenes", package.parents[1] / "scenes"]

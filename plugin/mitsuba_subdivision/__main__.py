@@ -19,17 +19,17 @@ from .whole_file import remove_unfinished
 INTERRUPTED = 130
 
 T = TypeVar("T")
-INTERVAL = 0.1  # Seconds between two looks at whether the work is done
+INTERVAL = 0.1  # Seconds between checks of the work
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return the exit status; after Ctrl-C, end the process if its work cannot be stopped."""
+    """Run a command and return the exit status; after Ctrl-C, end the process if its work cannot be stopped."""
     words = sys.argv[1:] if arguments is None else arguments
     with flushed_output():
         try:
             options, unknown = parser(words).parse_known_args(words)
             if unknown:
-                # The command's own parser reports them, with its usage and exit status.
+                # The command's parser reports them, with its usage and exit status.
                 options.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
             try:
                 with printed_warnings(CageWarning):
@@ -43,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _abandon() -> None:
-    # Interrupted work goes on in its thread, which nothing else than the end of the process stops.
+    # Interrupted work continues in its thread until the process ends.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     remove_unfinished()
     print_remark("interrupted")
@@ -51,9 +51,9 @@ def _abandon() -> None:
 
 
 def interruptible(work: Callable[[], T]) -> T:
-    """Run a function in another thread; if Ctrl-C is pressed before it is done, end the process.
+    """Run a function in another thread; Ctrl-C before its end ends the process.
 
-    Python notices Ctrl-C only between two of its instructions, and a single one can be a render of hours.
+    Python handles Ctrl-C only between two of its instructions, and one can be a render of hours.
     """
     if threading.current_thread() is not threading.main_thread():
         return work()
@@ -61,7 +61,7 @@ def interruptible(work: Callable[[], T]) -> T:
     try:
         future = executor.submit(contextvars.copy_context().run, work)
         while wait([future], INTERVAL).not_done:
-            # During a render, Mitsuba installs a handler of its own, which waits for the end of the render.
+            # During a render, Mitsuba installs a handler that waits for the end of the render.
             if handler is not None:
                 signal.signal(signal.SIGINT, handler)
     except KeyboardInterrupt:
@@ -70,7 +70,7 @@ def interruptible(work: Callable[[], T]) -> T:
     try:
         return future.result()
     finally:
-        del future  # An error's traceback would keep alive the objects that the work used
+        del future  # An error's traceback would keep the objects of the work alive
 
 
 if __name__ == "__main__":

@@ -1,12 +1,11 @@
-"""NumPy's values as arrays of Dr.Jit: the only place that converts them.
+"""The only conversion of NumPy arrays to Dr.Jit's.
 
-``mi.Float(array)`` takes NumPy's memory without a copy in LLVM variants. That has two dangers: kernels load whole
-packets, so the last load may reach beyond the array, where the process ends if no page is mapped; and a frozen function
-that drops such an array while it is recorded ends the process, too.
+In LLVM variants, ``mi.Float(array)`` uses NumPy's memory without a copy. This can end the process in two ways: kernels
+load whole packets, the last of which may reach beyond the array to an unmapped page; and a frozen function may drop
+such an array while it is recorded.
 
-- `mapped` maps a copy in NumPy's memory that reaches two packets beyond its values. All threads may read it at once,
-  so that shapes share such tables.
-- `upload` copies into Dr.Jit's own memory, and waits for that: for arrays that users hold and give away.
+- `mapped` maps a copy in NumPy's memory that reaches two packets beyond its values. All threads may read it, so that
+shapes share such tables. - `upload` copies into Dr.Jit's own memory, and waits for the copy: for arrays of users.
 """
 
 from __future__ import annotations
@@ -19,13 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from .llvm import require_llvm
 
-# Bytes of two packets of the widest numbers that kernels load, and of the alignment of arrays: Dr.Jit compiles one
-# kernel for aligned arrays and another one for others.
+# Bytes of two packets of the widest numbers in kernels, and alignment of arrays: Dr.Jit compiles different kernels for
+# aligned and unaligned arrays.
 PACKETS, CACHE_LINE = 256, 64
 
 
 def upload(kind: type, *parts: ArrayLike) -> Any:
-    """Copy arrays into one of Dr.Jit.
+    """Copy arrays into one Dr.Jit array.
 
     Parameters
     ----------
@@ -33,8 +32,8 @@ def upload(kind: type, *parts: ArrayLike) -> Any:
         A flat array such as ``mi.Float`` or ``mi.UInt32``, an array of vectors such as ``mi.Point3f``, or a tensor such
         as ``mi.TensorXf``. In scalar variants of Mitsuba, a single number or vector is one of these, too.
     *parts : array_like
-        Flattened and concatenated. Vectors lie one after the other, as in an array of shape ``(n, 3)``. A tensor is
-        made of one part, whose shape it has. Numbers are converted to the precision of ``kind``.
+        Flattened and concatenated. Vectors are rows, as in an array of shape ``(n, 3)``. A tensor has the shape of its
+        only part. Numbers are converted to the precision of ``kind``.
 
     Returns
     -------
@@ -48,15 +47,15 @@ def upload(kind: type, *parts: ArrayLike) -> Any:
     array = mapped(kind, *parts)
     if dr.is_jit_v(kind):
         array = dr.opaque(array)
-        # Another thread, such as one that loads a shape of this tensor, would not wait for the copy.
+        # Another thread, for instance one that loads a shape of this tensor, would not wait for the copy.
         dr.sync_thread()
     return array
 
 
 def mapped(kind: type, *parts: ArrayLike) -> Any:
-    """Make an array of Dr.Jit as `upload` does, in a copy of NumPy's that ends two packets beyond the values.
+    """Make a Dr.Jit array like `upload`, but in a NumPy copy that ends two packets beyond the values.
 
-    For arrays that no frozen function drops. Parameters and errors are those of `upload`.
+    For arrays that no frozen function drops. Parameters and errors are as in `upload`.
     """
     if dr.backend_v(kind) == dr.JitBackend.LLVM:
         require_llvm()
@@ -78,6 +77,6 @@ def mapped(kind: type, *parts: ArrayLike) -> Any:
 
 
 def take_over(array: Any) -> None:
-    """Move an array that a user assigns to Dr.Jit's own memory, in place, unless it has derivatives."""
+    """Move a user's array to Dr.Jit's own memory in place, unless it has derivatives."""
     if dr.is_jit_v(array) and not dr.grad_enabled(array):
         array[:] = dr.opaque(array)

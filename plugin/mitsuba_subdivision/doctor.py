@@ -1,4 +1,4 @@
-"""Tests what works on a machine: `mitsuba-subdivision doctor`."""
+"""The command `mitsuba-subdivision doctor`: versions, and tests of all variants."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from typing import Any
 from .llvm import loaded_version, lowest_version, select_llvm, version_without_package
 from .variants import variant_problem
 
-# Variants to try, and whether a machine without a device for them is a problem.
+# Variants to test, and whether a missing device is a problem.
 VARIANTS = {"scalar_rgb": True, "llvm_ad_rgb": True, "cuda_ad_rgb": False}
 PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "OpenEXR")
 DISTRIBUTION = "mitsuba-subdivision"
 _FOR_DEVELOPERS = ("dev", "test")  # Extras for developers of this package
-SECONDS = 120  # Starting Mitsuba on a slow disk takes some seconds, and a GPU's first kernels some more
-# Height of the limit surface of a cube with corners at -1 and 1, above the middle of its face: the limit mask there,
-# applied to the vertices of the cube refined once.
+SECONDS = 120  # The start of Mitsuba on a slow disk takes some seconds, and a GPU's first kernels some more
+# Height of the limit surface of a cube with corners at -1 and 1, at the middle of a face: the limit mask of the
+# vertices of the refined cube.
 CUBE_HEIGHT = 68 / 81
-_PIXEL = 1e-6  # Half the side of the pixel, so small that the height is the same all over it
+_PIXEL = 1e-6  # Half the side of the pixel, small enough for a constant height
 TOLERANCE = 1e-5
 _CHILD = "import json, sys; from mitsuba_subdivision import doctor; print(json.dumps(doctor._report(sys.argv[1])))"
 
@@ -47,7 +47,7 @@ def diagnose(variants: dict[str, bool] | None = None) -> dict[str, Any]:
 
 
 def in_words(diagnosis: dict[str, Any]) -> str:
-    """What `diagnose` returns, as lines of text."""
+    """Lines of text for the results of `diagnose`."""
     llvm, late = diagnosis["llvm"], diagnosis["late_llvm"]
     lines = [("machine", diagnosis["machine"])]
     lines += [(name, version or "MISSING") for name, version in diagnosis["versions"].items()]
@@ -73,11 +73,11 @@ def in_words(diagnosis: dict[str, Any]) -> str:
 
 
 def try_variant(variant: str, needed: bool = True, seconds: float = SECONDS) -> dict[str, Any]:
-    """Render a small surface in a separate process, so that a crash is reported; end it after some seconds.
+    """Render a small surface in a separate process with a time limit, to report crashes.
 
-    "works" says whether the surface is at the right place, and is None if the machine has no device for a variant that
-    is not needed; "problem" says why not; "exact_shading" and "exact_problem" likewise. "llvm" is the major version of
-    the library that Dr.Jit has loaded.
+    "works" is whether the surface is at the right place, or None if the machine lacks the device of an optional
+    variant; "problem" is the reason; "exact_shading" and "exact_problem" likewise. "llvm" is the major version of the
+    library that Dr.Jit has loaded.
     """
     start = time.monotonic()
     report = _in_process(variant, seconds)
@@ -105,7 +105,7 @@ def _in_process(variant: str, seconds: float) -> dict[str, Any]:
 
 
 def _report(variant: str) -> dict[str, Any]:
-    """As `try_variant`, in this process."""
+    """Result of `try_variant`, in this process."""
     import mitsuba as mi
 
     from .shapes.interaction_hook import exact_shading_problem
@@ -117,14 +117,14 @@ def _report(variant: str) -> dict[str, Any]:
     if problem := _problem(shading="vertex", tessellation_rate=2):
         return {**report, "works": False, "problem": problem}
     problem = exact_shading_problem(getattr(mi, variant))
-    # The triangles of one segment per edge lie far below the surface.
+    # With one segment per edge, triangles are far below the surface.
     if problem is None and (wrong := _problem(shading="exact", tessellation_rate=1)):
         problem = f"exact shading does not work: {wrong}"
     return {**report, "works": True, "exact_shading": problem is None, "exact_problem": problem}
 
 
 def _problem(**parameters: Any) -> str | None:
-    """What is wrong with the limit surface of a cube in a render of one pixel, in one line; None if nothing is."""
+    """One line about a wrong limit surface of a cube in a render of one pixel; None if it is right."""
     import mitsuba as mi
 
     from .cage.named_cages import cube
@@ -155,7 +155,7 @@ def _version(package: str) -> str | None:
 
 
 def _extras() -> dict[str, dict[str, str | None]]:
-    """Versions of the packages of each extra, as the metadata of the installed package names them."""
+    """Versions of the packages of each extra, by the metadata of the installed package."""
     try:
         required = importlib.metadata.requires(DISTRIBUTION) or []
     except importlib.metadata.PackageNotFoundError:

@@ -18,17 +18,17 @@ from .mesh.connectivity import IntArray, Topology, VertexRule
 from .mesh.cuts import seams
 from .surface import LimitSurface
 
-# Above this many classes of patches their weights take longer than the rest. Semi-sharp features count for more: each
-# refinement that they outlast costs about as much as another class.
+# Number of classes of patches above which their weights dominate the time. Semi-sharp features count once for each
+# refinement that they outlast.
 MANY_CLASSES = 1000
-HIGH_VALENCE = 12  # Valences above this are seen in renders as a pinch
-# Bytes of a mesh in single precision: position and normal of a vertex; its texture coordinates; three vertices and the
-# element of a triangle.
+HIGH_VALENCE = 12  # Higher valences are visible in renders as a pinch
+# Bytes of a mesh in single precision: position and normal of a vertex; texture coordinates; vertices and element of a
+# triangle.
 VERTEX_BYTES, TEXCOORD_BYTES, TRIANGLE_BYTES = 24, 8, 16
 
 
 def inspect(surface: LimitSurface, rate: int = 8) -> dict[str, Any]:
-    """Describe a cage under a scheme, and its tessellation with ``rate`` segments per edge, by plain values."""
+    """Describe a surface, and its tessellation with ``rate`` segments per edge, by plain values."""
     if rate < 1:
         raise ValueError(f"tessellation rate {rate}; expected 1 or more segments per edge")
     cage, t = surface.cage, surface.cage.topology
@@ -62,7 +62,7 @@ def inspect(surface: LimitSurface, rate: int = 8) -> dict[str, Any]:
 
 
 def in_words(inspected: dict[str, Any]) -> str:
-    """Lines of text with the values that `inspect` returns."""
+    """Lines of text for the values of `inspect`."""
     of = SimpleNamespace(**inspected)
     loops = f"{of.boundary_loop_count:,} loop{'s' * (of.boundary_loop_count != 1)}, rule {of.boundary}"
     boundary = f"{of.boundary_edge_count:,} edges in {loops}"
@@ -84,7 +84,7 @@ def in_words(inspected: dict[str, Any]) -> str:
 
 
 def _inner_vertices(cage: ControlCage) -> NDArray[np.bool_]:
-    """``(n_v,)`` whether faces go all around each vertex, once."""
+    """``(n_v,)`` whether faces surround each vertex exactly once."""
     t = cage.topology
     inner = ~t.is_border_vertex & (t.vertex_face_count > 0)
     return inner if cage.non_manifold is None else inner & ~cage.non_manifold.is_vertex
@@ -141,9 +141,9 @@ def _tessellation_size(surface: LimitSurface, rate: int) -> tuple[int, int]:
     if surface.scheme.domain.corner_count == 3:
         triangles = len(sizes) * rate**2
     else:
-        # A polygon's corners have a quarter of a square each; with an odd rate a triangle more closes its middle.
+        # Each corner of a polygon has a quarter of a square; with an odd rate, one more triangle closes the middle.
         triangles = np.where(sizes == 4, 2 * rate**2, sizes * (rate**2 + rate % 2) // 2).sum()
-    # Euler's formula, of the sphere: each handle and border changes it by next to nothing.
+    # Euler's formula for a sphere; handles and borders change it very little.
     return int(triangles), int(triangles) // 2 + 2
 
 
@@ -163,7 +163,7 @@ def _warnings(surface: LimitSurface) -> Iterator[str]:
     if scheme.element == "face":
         cut = cage.cut_mesh.topology
         border = cut.is_border_vertex & (cut.vertex_rules == VertexRule.AUTOMATIC)
-        # Schemes without rules at borders have no such number, and no cages with borders.
+        # Schemes without rules at borders have no such number, and accept no cages with borders.
         limit = scheme.regular_border_faces if border.any() else 0
         if crowded := np.count_nonzero(border & (cut.vertex_face_count >= 2 * limit)):
             where = f"{crowded:,} vertices on borders or creases"

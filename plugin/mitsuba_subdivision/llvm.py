@@ -1,8 +1,8 @@
 """The choice of the LLVM library that Dr.Jit loads.
 
-Dr.Jit looks for a library while it is imported, takes the first that it finds, and keeps it. On x86-64 its kernels use
-instructions that LLVM has only since version 17. With an older library, the first kernel that takes a minimum or a
-maximum ends the whole process. So this package chooses a library before Dr.Jit does.
+Dr.Jit loads the first library that it finds when it is imported. On x86-64 its kernels need LLVM 17 or newer: with an
+older library, the first kernel with a minimum or a maximum ends the process. So this package chooses a library before
+Dr.Jit does.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ INSTALL_HINT = (
     f"pip install 'mitsuba-subdivision[llvm]', or set {ENVIRONMENT_VARIABLE} to the path of an LLVM library"
     " before Python starts"
 )
-# Takes the place of a path where no library is usable. Dr.Jit prints the path that it cannot load, so this says why.
+# Path in place of a usable library. Dr.Jit prints the path that it cannot load, so it contains the reason.
 NO_USABLE_LLVM = "no LLVM library that Dr.Jit runs without aborting; see mitsuba_subdivision.llvm"
 
 _TOO_LATE = "Dr.Jit was imported first"
@@ -39,7 +39,7 @@ _SYSTEM_FOLDERS = (
 class LlvmChoice(NamedTuple):
     """The library for Dr.Jit to load."""
 
-    path: str | None  # None if Dr.Jit searches by itself, or if no library is usable
+    path: str | None  # None if Dr.Jit searches itself, or if no library is usable
     version: int | None  # Major version, None if unknown; without a path, of the newest library, which is too old
     reason: str
 
@@ -58,7 +58,7 @@ def select_llvm() -> LlvmChoice:
     with an exception instead of ending the process. If there is none, or no Linux, Dr.Jit searches by its own rules.
     """
     chosen = os.environ.get(ENVIRONMENT_VARIABLE)
-    # A process that found no usable library leaves a note to its children.
+    # Set by a parent process that found no usable library.
     if chosen and chosen != NO_USABLE_LLVM:
         return LlvmChoice(chosen, library_version(chosen), f"{ENVIRONMENT_VARIABLE} is set")
     if "drjit" in sys.modules:
@@ -108,7 +108,7 @@ def llvm_problem() -> str | None:
 
 
 def imported_too_late() -> bool:
-    """Whether Dr.Jit has no usable library only because it was imported first."""
+    """Whether Dr.Jit lacks a usable library only because it was imported first."""
     return llvm_problem() is not None and select_llvm().reason == _TOO_LATE and _search().path is not None
 
 
@@ -169,7 +169,7 @@ def _known_version(path: str) -> int:
     except OSError:
         return 0
     if not hasattr(library, "LLVMGetVersion"):
-        # LLVM has `LLVMGetVersion` since version 16.
+        # `LLVMGetVersion` exists since LLVM 16.
         return 15 if hasattr(library, "LLVMGetGlobalContext") else 0
     major = ctypes.c_uint()
     library.LLVMGetVersion(ctypes.byref(major), None, None)
@@ -182,8 +182,8 @@ def _libraries(patterns: Iterable[str]) -> list[str]:
 
 
 def _python_folders() -> list[str]:
-    """Folders of libraries of the Python environment, and of packages that were installed into another folder."""
+    """Folders of libraries of the Python environment, and of packages in other folders."""
     prefixes = [sys.prefix, sys.base_prefix, site.getuserbase(), *filter(None, sys.path)]
-    # A wheel puts libraries two folders above its modules, or where modules are all alone below them.
+    # Wheels have libraries two folders above their modules, or directly below them with `pip install --target`.
     above = [os.path.dirname(os.path.dirname(folder)) for folder in sys.path if folder.endswith("-packages")]
     return [glob.escape(folder) for folder in dict.fromkeys([*(f"{prefix}/lib" for prefix in prefixes), *above])]

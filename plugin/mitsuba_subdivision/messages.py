@@ -1,6 +1,6 @@
-"""Messages of the command line, results on standard output and all others on standard error; and progress of long work.
+"""Messages of the command line: results on standard output, the rest on standard error; progress of long work.
 
-Progress is a line on a terminal that is erased at the end; a pipe or a file gets none.
+Progress is a line on a terminal, erased at the end; pipes and files get none.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import TextIO, TypeVar
 
 PROGRAM = "mitsuba-subdivision"
 PATIENCE = 1.0  # Seconds before a line of progress appears
-# Errors that wrong input can raise. Any other error is a defect of this package, and keeps its traceback.
+# Errors of wrong input. Any other error is a defect of this package, and keeps its traceback.
 USER_ERRORS = (ValueError, OSError, RuntimeError, MemoryError)
 
-# Mitsuba's message about an error in a plugin has the whole traceback in it.
+# Mitsuba's message about an error in a plugin contains the whole traceback.
 _TRACEBACK = re.compile(r"Traceback \(most recent call last\):\n(?:[ \t].*\n)*(?:[\w.]+: )?")
 
 T = TypeVar("T")
@@ -41,7 +41,7 @@ def print_remark(text: str) -> None:
 
 @contextmanager
 def printed_warnings(category: type[Warning]) -> Iterator[None]:
-    """Print each warning of a category, however often it is issued, and print no warning with a line of code."""
+    """Print every warning of a category, also repeated ones, and no warning with a line of code."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", category)
         warnings.showwarning = lambda message, *_place, **_more: print_remark(f"warning: {message}")
@@ -50,7 +50,7 @@ def printed_warnings(category: type[Warning]) -> Iterator[None]:
 
 @contextmanager
 def flushed_output() -> Iterator[None]:
-    """Flush the standard streams at the end: Python flushes so late that a closed pipe would leave a traceback."""
+    """Flush the standard streams at the end: in Python's later flush, a closed pipe would cause a traceback."""
     try:
         yield
     finally:
@@ -59,7 +59,7 @@ def flushed_output() -> Iterator[None]:
 
 
 def counted(items: Sequence[T], what: str) -> Iterator[T]:
-    """Iterate over items, and count them on a terminal after ``what`` they are."""
+    """Iterate over items, and count them on a terminal after the word ``what``."""
     from tqdm import tqdm  # Only here, as it takes some time to import
 
     return iter(tqdm(items, desc=what, leave=False, delay=PATIENCE, disable=not _is_terminal()))
@@ -67,7 +67,7 @@ def counted(items: Sequence[T], what: str) -> Iterator[T]:
 
 @contextmanager
 def timed(what: str) -> Iterator[Callable[[str], None]]:
-    """Show a line for work of few long steps; yield a function that names the current step, after ``what``."""
+    """Show a line for few long steps; yield a function that names the current step after ``what``."""
     if not _is_terminal():
         yield lambda step: None  # noqa: ARG005
         return
@@ -78,7 +78,7 @@ def timed(what: str) -> Iterator[Callable[[str], None]]:
 
 
 def _text_of(error: BaseException) -> str:
-    # Dr.Jit's own message refers to the one of the error that it was raised from.
+    # Dr.Jit's own message refers to the error that caused it.
     while error.__cause__ is not None and "(see above)" in str(error):
         error = error.__cause__
     if isinstance(error, OSError) and error.strerror:
@@ -99,7 +99,7 @@ def _print(text: object, stream: TextIO | None) -> None:
             print(text, file=stream)
         stream.flush()
     except BrokenPipeError:
-        # Otherwise Python tries once more when it ends.
+        # Otherwise Python tries again when it ends.
         with suppress(OSError, ValueError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 

@@ -1,4 +1,4 @@
-"""Triangles and curves in memory: as a shape of Mitsuba, as an entry of a scene that can be loaded, and as a file."""
+"""Triangles and curves as Mitsuba shapes, as scene entries and as files."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from .mesh.connectivity import IntArray
 from .variants import SceneNode
 from .whole_file import write_text
 
-# Buffers that a mesh has without adding them as attributes, and their columns in a PLY file.
+# Built-in buffers of a mesh, and their columns in a PLY file.
 _BUFFERS = {"vertex_positions": "xyz", "vertex_normals": ("nx", "ny", "nz"), "vertex_texcoords": "uv"}
 
 
 def mitsuba_mesh(
     name: str,
     triangles: NDArray[np.integer],  # (m, 3)
-    # (n, k) each: `vertex_positions`, and if the mesh has them `vertex_normals`, `vertex_texcoords`, and attributes of
-    # vertices or faces, `vertex_NAME` or `face_NAME`
+    # (n, k) each: `vertex_positions` and optional `vertex_normals`, `vertex_texcoords`, and attributes of vertices or
+    # faces, `vertex_NAME` or `face_NAME`
     buffers: Mapping[str, NDArray],
-    # Whether vertices get the averages of the normals of their triangles. Without normals, triangles are flat.
+    # Whether vertex normals are averages of their triangles'. Without normals, triangles are flat.
     averages_normals: bool = False,
     **parts: mi.Object | None,  # `bsdf`, `emitter` and `interior`
 ) -> mi.Mesh:
@@ -60,7 +60,7 @@ def mitsuba_mesh(
 
 @dataclass(frozen=True, eq=False)
 class PolygonMesh:
-    """Triangles in the world, with their own normals or flat."""
+    """Triangles in world space, with vertex normals or flat."""
 
     name: str
     triangles: IntArray  # (n_t, 3)
@@ -69,8 +69,8 @@ class PolygonMesh:
     suffix: ClassVar = ".ply"
 
     def entry(self, bsdf: SceneNode, emitter: SceneNode | None) -> SceneNode:
-        """The mesh as an entry of a scene, for `with_meshes` and `save_scene`."""
-        # Otherwise Mitsuba would make normals.
+        """Scene entry of the mesh, for `with_meshes` and `save_scene`."""
+        # Otherwise Mitsuba would compute normals.
         facets = {} if "vertex_normals" in self.vertices else {"face_normals": True}
         shining = {} if emitter is None else {"emitter": emitter}
         return {"type": "ply", "mesh": self, **facets, "bsdf": bsdf, **shining}
@@ -90,12 +90,12 @@ class PolygonMesh:
 
 @dataclass(frozen=True, eq=False)
 class CurveSet:
-    """Tubes around curves as Mitsuba has them, which reads them from files only."""
+    """Tubes around curves, which Mitsuba reads from files only."""
 
     type: str  # "linearcurve" or "bsplinecurve"
     points: NDArray[np.float64]  # (m, 4): control points and radii
     counts: IntArray  # (n,): points of each curve
-    textures: SceneNode = field(default_factory=dict)  # Attributes, as parameters of the shape
+    textures: SceneNode = field(default_factory=dict)  # Attributes as parameters of the shape
     suffix: ClassVar = ".txt"
 
     def placed(self, matrices: NDArray[np.float64]) -> CurveSet:
@@ -105,7 +105,7 @@ class CurveSet:
         return replace(self, points=points, counts=np.tile(self.counts, len(matrices)))
 
     def entry(self, attributes: Mapping[str, Attribute], bsdf: SceneNode) -> SceneNode:
-        """The shape, with attributes along its segments, as an entry of a scene for `with_meshes` and `save_scene`."""
+        """Scene entry of the shape, with attributes along its segments, for `with_meshes` and `save_scene`."""
         bitmap = {"type": "bitmap", "filter_type": "nearest", "wrap_mode": "clamp", "accel": False}
         textures: SceneNode = {}
         for name, attribute in attributes.items():
@@ -114,14 +114,14 @@ class CurveSet:
         return {"type": self.type, "mesh": replace(self, textures=textures), **textures, "bsdf": bsdf}
 
     def loaded(self, bsdf: mi.BSDF, *_: object) -> mi.Object:
-        """The shape as an object of Mitsuba, which neither emits light nor has an interior."""
+        """The shape as a Mitsuba object, without emitter and interior."""
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / f"curves{self.suffix}"
             self.save(path)
             return mi.load_dict({"type": self.type, "filename": str(path), **self.textures, "bsdf": bsdf})
 
     def save(self, path: Path) -> None:
-        """Write the file that Mitsuba reads: a line for each point, and an empty one between curves."""
+        """Write Mitsuba's file: a line for each point, and an empty line between curves."""
         lines = "\n".join("%.9g %.9g %.9g %.9g\n" * count for count in self.counts.tolist())
         write_text(path, lines % tuple(self.points.ravel().tolist()))
 
@@ -151,10 +151,10 @@ def with_meshes(scene: SceneNode) -> SceneNode:
 
 
 def points_at(points: NDArray, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points ``(n, 3)`` transformed by a matrix ``(4, 4)``, or by each of several ``(m, 4, 4)``: ``(m, n, 3)``."""
+    """Points ``(n, 3)`` transformed by a matrix ``(4, 4)``, or by several ``(m, 4, 4)``: ``(m, n, 3)``."""
     return points @ matrix[..., :3, :3].swapaxes(-2, -1) + matrix[..., None, :3, 3]
 
 
 def box_corners(box: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The eight corners ``(8, 3)`` of a box, given by its least and greatest coordinates ``(2, 3)``."""
+    """The eight corners ``(8, 3)`` of a box with least and greatest coordinates ``(2, 3)``."""
     return np.array(np.meshgrid(*box.T)).reshape(3, -1).T

@@ -1,4 +1,4 @@
-"""Mitsuba as functions take it: its module with a variant set, the module of a variant, or a variant's name."""
+"""Variants of Mitsuba, given as its module with a variant set, the module of a variant, or a variant's name."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from typing import Any, TypeAlias
 
 from .llvm import best_variant, llvm_problem, loaded_version, require_llvm
 
-# The module of a variant, such as mitsuba.llvm_ad_rgb. For mypy, a class of a `ModuleType` is no base class.
+# The module of a variant, such as mitsuba.llvm_ad_rgb. For mypy, a class in a `ModuleType` is no base class.
 Variant: TypeAlias = Any
-SceneNode = dict[str, Any]  # A scene or an entry of one, as `mi.load_dict` takes it
-OPENEXR_THREADS = 2  # Mitsuba reads and writes OpenEXR files by one thread that waits, and one that works
+SceneNode = dict[str, Any]  # A scene or its entry, for `mi.load_dict`
+OPENEXR_THREADS = 2  # Mitsuba's OpenEXR files need one thread that waits and one that works
 EXPECTED = 'the module mitsuba with a variant set, a variant such as mitsuba.llvm_ad_rgb, or its name, "llvm_ad_rgb"'
 
 
 def variant_module(mi: ModuleType | str) -> ModuleType:
-    """Module of a variant, given as `EXPECTED` says; raises ValueError for anything else and for unknown variants."""
+    """Module of a variant in one of the forms of `EXPECTED`; raises ValueError for any other value."""
     import mitsuba
 
     name = variant_name(mi)
@@ -36,7 +36,7 @@ def _unknown(name: str) -> str | None:
 
 
 def variant_problem(name: str) -> str | None:
-    """Why a variant cannot run here, None if it can."""
+    """Reason why a variant cannot run here, None if it can."""
     import drjit as dr
 
     if problem := _unknown(name):
@@ -47,7 +47,7 @@ def variant_problem(name: str) -> str | None:
 
 
 def chosen_variant(name: str | None) -> str:
-    """The variant of this name, or else the best. Raises ValueError, RuntimeError if it cannot run here."""
+    """The variant of this name, or else the best. Raises ValueError or RuntimeError if it cannot run here."""
     if name is None:
         return best_variant()
     if name.startswith("llvm"):
@@ -58,10 +58,10 @@ def chosen_variant(name: str | None) -> str:
 
 
 def set_variant(name: str | None) -> None:
-    """Set a variant of Mitsuba, or else the best, in a process of this package, such as a command.
+    """Set a variant of Mitsuba, or else the best, in a process of this package, for instance a command.
 
-    On a machine with one core, Dr.Jit starts a thread more: without one, Mitsuba 3.9 waits for ever when it reads or
-    writes OpenEXR files. Raises as `chosen_variant` does.
+    On a machine with one core, Dr.Jit starts another thread: with one thread, Mitsuba 3.9 never finishes reading or
+    writing OpenEXR files. Errors are those of `chosen_variant`.
     """
     import drjit as dr
     import mitsuba
@@ -102,7 +102,7 @@ def variant_set(mi: ModuleType | str) -> Iterator[ModuleType]:
 
 
 def variant_name(mi: ModuleType | str) -> str:
-    """Name of a variant, such as "llvm_ad_rgb"; as `variant_module`, but names are not checked."""
+    """Name of a variant, such as "llvm_ad_rgb"; like `variant_module`, but names are not checked."""
     if isinstance(mi, str):
         return mi
     mitsuba = sys.modules.get("mitsuba")
@@ -116,18 +116,18 @@ def variant_name(mi: ModuleType | str) -> str:
     raise ValueError(f"{mi!r}; expected {EXPECTED}")
 
 
-# Fields that distinguish processors of one name on x86, and that identify those of ARM, which have no name.
+# Fields that distinguish x86 processors of one name, and identify ARM processors, which have no name.
 _NUMBERS = ("cpu family", "model", "CPU implementer", "CPU architecture", "CPU variant", "CPU part")
 
 
 def environment(variant: str) -> dict[str, str]:
-    """Versions of libraries, and the processor, that renders in a variant depend on."""
+    """Versions of libraries and the processor, which affect renders in a variant."""
     import drjit
     import mitsuba
     import numpy
     import scipy
 
-    # Without this package: tests of renders are for its changes.
+    # Without this package, whose changes are what tests of renders test.
     versions = {module.__name__: str(module.__version__) for module in (mitsuba, drjit, numpy, scipy)}
     versions["processor"] = _processor()
     if variant.startswith("llvm"):
@@ -136,14 +136,14 @@ def environment(variant: str) -> dict[str, str]:
 
 
 def _processor() -> str:
-    # Code for another processor may add in another order. On Linux, `platform` does not know the model.
+    # Code for another processor may add in another order. On Linux, `platform` lacks the model.
     listed = Path("/proc/cpuinfo")
     name = _first_of(listed.read_text(encoding="utf-8", errors="replace")) if listed.is_file() else ""
     return name or platform.processor() or platform.machine()
 
 
 def _first_of(information: str) -> str:
-    """The first processor of Linux's list, by its name and numbers: generations share names such as "AMD EPYC"."""
+    """The first processor of Linux's list, by name and numbers: generations share names such as "AMD EPYC"."""
     lines = [line.split(":", 1) for line in information.split("\n\n", 1)[0].splitlines() if ":" in line]
     values = {name.strip(): value.strip() for name, value in lines}
     names = ["model name", *_NUMBERS]

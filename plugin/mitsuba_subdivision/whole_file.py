@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Output files that are complete or absent."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-# Most characters of a name that are kept: a file name has at most 255 bytes, and a character may take four.
+# Number of characters of a name to keep: a file name has at most 255 bytes, and a character up to four.
 _LONGEST_STEM = 40
 
 _unfinished: set[Path] = set()
@@ -18,11 +18,10 @@ _unfinished: set[Path] = set()
 def whole_file(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path`` to write to; at the end, that file replaces ``path``.
 
-    The temporary name has the suffix of ``path``. If writing fails, nothing stays behind, and a file that was there
-    before is as it was. A process that is killed leaves its temporary file, ".NAME.NUMBER.part.SUFFIX". If several
-    processes write one file, the last to end wins. Links are followed. Pipes and devices are written to directly.
-    Raises FileNotFoundError if the folder does not exist. Raises OSError if the file cannot be written; the message
-    names ``path``.
+    The temporary name has the suffix of ``path``. If writing fails, the temporary file is removed, and an existing file
+    is unchanged. A killed process leaves its temporary file, ".NAME.NUMBER.part.SUFFIX". If several processes write one
+    file, the last to end wins. Links are followed. Pipes and devices are written to directly. Raises FileNotFoundError
+    if the folder does not exist. Raises OSError if the file cannot be written; the message names ``path``.
     """
     path = Path(path)
     if path.exists() and not path.is_file() and not path.is_dir():
@@ -34,7 +33,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     with _temporary(path) as beside:
         try:
             yield beside
-            # Wait until it is on its disk: some systems notice only then that the disk is full.
+            # Wait for the disk: some systems report a full disk only then.
             with beside.open("r+b") as stream:
                 os.fsync(stream.fileno())
             beside.replace(path)
@@ -54,9 +53,9 @@ def write_text(path: Path, text: str) -> None:
 
 
 def require_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
-    """Check that a file can be written to a path, before its contents are computed; create its folder.
+    """Check that a path can be written to, before its contents are computed; create its folder.
 
-    Raises ValueError if ``path`` is one of the files that the work reads, OSError if it cannot be written.
+    Raises ValueError if ``path`` is an input, OSError if it cannot be written.
     """
     for other in inputs:
         if path.exists() and other.exists() and path.samefile(other):
@@ -76,7 +75,7 @@ def require_writable(path: Path, inputs: Iterable[Path] = ()) -> None:
 
 
 def require_folder(folder: Path) -> None:
-    """Create a folder and its parents unless they exist. Raises OSError if it cannot be made."""
+    """Create a folder and its parents unless they exist. Raises OSError if this fails."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except FileExistsError:
@@ -86,7 +85,7 @@ def require_folder(folder: Path) -> None:
 
 
 def remove_unfinished() -> None:
-    """Remove the temporary files of this process before it ends."""
+    """Remove the temporary files of this process."""
     for beside in _unfinished.copy():
         with suppress(OSError):
             beside.unlink(missing_ok=True)

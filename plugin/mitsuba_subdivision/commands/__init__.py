@@ -1,7 +1,7 @@
 """The commands of ``mitsuba-subdivision``, and the parser of the command line.
 
-A new command is a line of `COMMANDS` and a function. The function gets the command's parser, adds its options, and sets
-as default ``run`` another one that gets the parsed options and returns the exit status.
+A new command is a line of `COMMANDS` and a function that adds options to the command's parser. It sets the default
+``run`` to a function of the parsed options that returns the exit status.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from .. import __version__
 from ..messages import PROGRAM
 from .arguments import CommandParser
 
-# ``module.function`` of this package, and a line of the program's help. A module is imported only if its command is
-# named: some take longer to import than others to run.
+# ``module.function`` of this package, and a line of the program's help. Only the module of the given command is
+# imported, as some imports are slow.
 COMMANDS = {
     "figure": ("figure.figure", "draw a figure of the documentation"),
     "render": ("render.render", "render a scene, or a model in a studio"),
@@ -28,7 +28,7 @@ COMMANDS = {
 
 
 def parser(
-    words: Sequence[str] = tuple(COMMANDS),  # Of the command line: only commands named there get options
+    words: Sequence[str] = tuple(COMMANDS),  # Of the command line: only its commands get options
 ) -> CommandParser:
     """The parser of the whole command line."""
     about, hint = "Exact subdivision surfaces for Mitsuba 3.", f'"{PROGRAM} COMMAND --help" describes a command.'

@@ -1,4 +1,4 @@
-"""Options shared by several commands, and parsers of their values."""
+"""Options of several commands, and parsers of their values."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any, NoReturn, TypeVar
 from ..schemes import BUILT_IN
 from ..tessellation import HIGHEST_RATE
 
-USAGE_ERROR = 2  # Exit status of wrong usage, as argparse has it
+USAGE_ERROR = 2  # Exit status of wrong usage, as in argparse
 
 V = TypeVar("V")
 
@@ -33,7 +33,7 @@ def add_cage_options(parser: argparse._ActionsContainer, default_rate: str) -> N
 
 
 def checked(kind: Callable[[str], V], is_allowed: Callable[[V], bool], expected: str) -> Callable[[str], V]:
-    """Make the parser of an argument's values; its errors name the expected ones."""
+    """Make a parser of an argument's values whose errors name the expected values."""
 
     def parsed(text: str) -> V:
         try:
@@ -57,14 +57,14 @@ rate = checked(int, lambda value: 1 <= value <= HIGHEST_RATE, f"an integer from 
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser with wide columns in its help, whose command may have exit statuses of its own for errors.
+    """A parser with wide columns in its help, and other exit statuses for errors if the command has them.
 
     The defaults ``error_status`` and ``usage_status`` are the exit statuses for unusable input and for wrong usage.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**{"formatter_class": _HelpFormatter, **options})
-        # Values such as -0.25:0.25 are no options either.
+        # Values such as -0.25:0.25 are not options.
         self._negative_number_matcher = re.compile(r"^-\.?\d[\d.:]*$")
 
     def error(self, message: str) -> NoReturn:
@@ -73,7 +73,7 @@ class CommandParser(argparse.ArgumentParser):
 
 
 class _HelpFormatter(argparse.HelpFormatter):
-    """Help with a wide column of options. Texts may have paragraphs, and tables, which keep their lines."""
+    """Help with a wide column of options. Paragraphs and tables in texts keep their lines."""
 
     def __init__(self, prog: str, **options: Any) -> None:
         super().__init__(prog, **{"max_help_position": 28, **options})
@@ -90,5 +90,5 @@ class _HelpFormatter(argparse.HelpFormatter):
 
 
 def table(title: str, rows: dict[str, str]) -> str:
-    """Names and their meanings, in lines for the help of a command."""
+    """Lines of names and meanings for the help of a command."""
     return "\n".join([f"{title}:", *(f"  {name:<12} {text}" for name, text in rows.items())])

@@ -1,4 +1,4 @@
-"""Work on the workers of a Dask cluster: frames, and passes of an image."""
+"""Frames and passes on the workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# A worker may have several threads. But Mitsuba has one variant at a time, and an LLVM variant takes all cores.
+# One render at a time in a worker: Mitsuba has one variant at a time, and an LLVM variant uses all cores.
 _lock = threading.Lock()
 
 
@@ -44,10 +44,10 @@ def cluster(address: str) -> Iterator[Client]:
 
 
 def results(client: Client, work: Callable[[int], T], numbers: Sequence[int]) -> Iterator[tuple[int, T]]:
-    """Numbers and results of picklable work, as the workers of a cluster finish; work of lost workers is repeated."""
+    """Numbers and results of picklable work, in the order of completion; work of lost workers is repeated."""
     from distributed import as_completed
 
-    # Not pure, in the sense of Dask: a repeated request renders again.
+    # Not pure in Dask's sense: a repeated request renders again.
     futures = as_completed(client.map(partial(_work, work, str(mi.variant())), numbers, pure=False), with_results=True)
     return (result for _, result in futures)
 
@@ -66,10 +66,10 @@ def render_on_cluster(
     *,
     with_probe: bool = False,
 ) -> Image:
-    """Render the passes of an image on the workers of a cluster, or as many as these have threads, and merge them.
+    """Render passes of an image on the workers of a cluster, by default one for each of their threads, and merge them.
 
-    With the box filter and an LLVM variant, the image has the same bits as the same passes on one machine, if the
-    workers have that machine's versions and processor.
+    With the box filter and an LLVM variant, the image has the same bits as the same passes on one machine with the
+    workers' versions and processor.
     """
     with cluster(address) as client, timed("Rendering on the cluster"):
         count = count or min(sum(client.nthreads().values()), sampling.batches)

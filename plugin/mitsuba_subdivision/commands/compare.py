@@ -20,7 +20,7 @@ from ..variants import variant_set
 from ..whole_file import require_folder, require_writable, write_text
 from .arguments import CommandParser, checked, positive, seed, table
 
-# Exit status of ``compare`` and ``merge`` for input or output that cannot be used: 1 and 2 say how images differ.
+# Exit status of ``compare`` and ``merge`` for unusable input or output, as 1 and 2 are results of comparisons.
 UNUSABLE = 3
 TOLERANCES = f"Tolerances: {', '.join(Tolerances().as_dict())}."
 
@@ -107,7 +107,7 @@ def _compare(options: argparse.Namespace) -> int:
     text = json.dumps(comparison.as_dict(), indent=1)
     if options.json and options.json != "-":
         write_text(Path(options.json), f"{text}\n")
-    # The result first, which a report that cannot be written does not hide.
+    # The result comes first, also if the report cannot be written.
     print_result(text if options.json == "-" else comparison)
     page = write_report(options.html, comparison) if options.html else None
     if page and options.json == "-":

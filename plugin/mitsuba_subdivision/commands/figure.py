@@ -13,7 +13,7 @@ from ..variants import set_variant
 from ..whole_file import require_folder, require_writable
 from .arguments import CommandParser, add_variant, checked, positive, table
 
-# Ignored by git: pictures of the pages lie beside it, in renders/figures, and another processor draws other last bits.
+# Ignored by git. The pictures of the pages are in renders/figures, as other processors draw other last bits.
 DRAWN = Path("renders/drawn")
 WIDEST = 1200.0  # Millimetres, for posters
 

@@ -1,4 +1,4 @@
-"""The commands ``info`` and ``tessellate``, about a control cage in a file, and ``doctor``, about the machine."""
+"""The commands ``info`` and ``tessellate`` for control cages in files, and ``doctor`` for the machine."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _info(options: argparse.Namespace) -> None:
     from ..inspection import in_words, inspect
 
     inspected = inspect(_surface(options), options.rate)
-    # Without the quotes that names of files have in messages.
+    # Without the quotes around file names in messages.
     plain = {**inspected, "name": inspected["name"].replace('"', "")}
     print_result(json.dumps(plain, indent=1) if options.json else in_words(inspected))
 

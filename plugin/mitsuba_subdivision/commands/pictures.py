@@ -1,4 +1,4 @@
-"""Pictures that the command ``render`` writes: of scenes and of models, frames, videos, and images by passes."""
+"""Pictures, frames, videos and passes of scenes and models, for the command ``render``."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ from .cluster import cluster, render_on_cluster, results
 
 VIDEO_SUFFIXES = (".gif", ".mp4")
 DEFAULT_FPS = 24
-# Options that select one mesh of a USD file, and those of whole ones.
+# Options for one mesh of a USD file, and for whole USD files.
 _OF_ONE_MESH = ("up", "scheme", "prim", "checker", "cage")
 _OF_STAGES = ("shutter", "texture_size", "camera", "over")
-# Options that `Look` has by the same names.
+# Options that are also fields of `Look`.
 _OF_LOOK = ("up", "size", "spp", "rate", "checker", "cage", "texture_size", "transparent", "aovs")
-EVEN = 2  # Sides of the pictures in an MP4 file are multiples of this; others lose a row or a column
+EVEN = 2  # Sides of pictures in MP4 files are multiples of this; others lose a row or a column
 _Animation = FrameRange | Turntable | StillPicture
 _Shown = tuple[_Animation, SceneSource[Any]]
 
 
 class Picture(NamedTuple):
-    """Pixels of a rendered picture, with its colour and its AOVs, and the parts of it that render products have."""
+    """Pixels of a rendered picture, with its colour and AOVs, and the channels of render products."""
 
     pixels: NDArray[np.float32]  # (height, width, channels)
     channels: tuple[str, ...]
-    products: dict[str, list[str]]  # Names of AOVs of products, by their names; "" is the colour
+    products: dict[str, list[str]]  # Names of the AOVs of each product; "" is the colour
 
 
 def is_stage(options: argparse.Namespace) -> bool:
@@ -72,7 +72,7 @@ def picture_of_scene(options: argparse.Namespace) -> Picture:
 
 
 def write_frames(options: argparse.Namespace) -> None:
-    """Render the frames of a model that do not exist yet, and write them, and the video of all."""
+    """Render and write the missing frames of a model, and a video of all frames."""
     is_video = options.output.suffix.lower() in VIDEO_SUFFIXES
     if is_video:
         _require_encoder(options.output)
@@ -117,7 +117,7 @@ def _bitmap(image: NDArray[np.float32], channels: list[str], *, in_8_bits: bool)
         return mi.Bitmap(image, mi.Bitmap.PixelFormat.MultiChannel, channels)
     if not in_8_bits or image.shape[2] != 4:
         return mi.util.convert_to_bitmap(image, uint8_srgb=in_8_bits)
-    # PNG files have colours that are not multiplied by alpha.
+    # PNG files have straight alpha.
     rgba, straight = mi.Bitmap.PixelFormat.RGBA, mi.Bitmap.AlphaTransform.Unpremultiply
     return mi.Bitmap(image, rgba).convert(rgba, mi.Struct.Type.UInt8, True, straight)
 
@@ -128,7 +128,7 @@ def _render_picture(
     spp: int | None = None,
     source: SceneSource[Any] | None = None,
 ) -> Picture:
-    """Mean picture of scenes that share no samples: one, or those of a frame's sub-frames."""
+    """Picture of one scene, or mean of a frame's sub-frames, with different samples."""
     count, _ = options.shutter or (1, None)
     total: Any = 0.0
     for part, loaded in enumerate(scenes):
@@ -137,20 +137,20 @@ def _render_picture(
             weigh_lights(loaded.scene, loaded.sensor_index)
             image = render_image(loaded, spp or loaded.sensor.sampler().sample_count(), seed)
             if options.denoise:
-                # Each by itself, as its albedo and normals are those of its time.
+                # Denoised separately, with the albedo and normals of its time.
                 image = denoised(loaded, image, seed)
         total = total + image / count
     channels = loaded.channel_names(total.shape[2])
     if source is None:
         return Picture(total, channels, {})
-    # Small models are rendered as larger ones.
+    # Small models are enlarged.
     lengths = [name for name, kind in source.aovs.items() if kind in LENGTHS]
     total[..., [channel.rpartition(".")[0] in lengths for channel in channels]] /= source.factor or 1.0
     return Picture(total, channels, source.products)
 
 
 def model_pictures(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
-    """Frames of a model, or its picture as number 1, with their numbers, as they are finished."""
+    """Frames of a model, or its picture as number 1, with their numbers, in the order of completion."""
     if options.dask:
         return _on_cluster(options, numbers)
     shown, source = _shown(options)
@@ -161,8 +161,8 @@ def model_pictures(options: argparse.Namespace, numbers: Sequence[int]) -> Itera
 
 
 def render_by_passes(options: argparse.Namespace, is_model: bool) -> None:
-    """Render by passes, in the current variant, here or on a cluster, and write the image."""
-    # Workers get it, too, and may be in another folder.
+    """Render by passes in the current variant, in this process or on a cluster, and write the image."""
+    # Workers get the path, too, and may have another working folder.
     load: Callable[[], LoadedScene] = partial(_load_still, _as_data(options))
     if not is_model:
         path = options.scene.resolve() if options.dask else options.scene
@@ -175,7 +175,7 @@ def render_by_passes(options: argparse.Namespace, is_model: bool) -> None:
     number, count = options.share or (1, options.passes or 1)
     batch = options.batch or min(renders.BATCH, max(1, spp // max(renders.LEAST_BATCHES, count)))
     if is_model:
-        # Mitsuba would round each batch up, and more samples than recorded would count.
+        # Otherwise Mitsuba would round each batch up, to more samples than recorded.
         batch = sampler(batch)["sample_count"]
     sampling = renders.Sampling(max(1, -(-spp // batch)), batch, options.seed)
     settings = {"with_probe": options.reference}
@@ -194,7 +194,7 @@ def render_by_passes(options: argparse.Namespace, is_model: bool) -> None:
 
 
 def _as_data(options: argparse.Namespace) -> dict[str, Any]:
-    """Options by which another process, in another folder, renders the same pictures."""
+    """Options with which a process in another folder renders the same pictures."""
     given = {name: value for name, value in vars(options).items() if name not in ("run", "parser")}
     return given | {"scene": options.scene.resolve()}
 
@@ -205,7 +205,7 @@ def _load_still(given: dict[str, Any]) -> LoadedScene:
 
 
 def _on_cluster(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator[tuple[int, Picture]]:
-    # The command's own number: files may change until the next one.
+    # A number of this command, as files may change before the next one.
     command = pickle.dumps(_as_data(options) | {"command": uuid4().hex})
     warned: set[str] = set()
     with cluster(options.dask) as client:
@@ -218,7 +218,7 @@ def _on_cluster(options: argparse.Namespace, numbers: Sequence[int]) -> Iterator
 
 
 def _frame(command: bytes, number: int) -> tuple[Picture, list[str]]:
-    """A picture, and the messages of warnings; runs on a worker."""
+    """A picture and messages of warnings; runs on a worker."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", CageWarning)
         options, (shown, source) = _kept(command)
@@ -228,13 +228,13 @@ def _frame(command: bytes, number: int) -> tuple[Picture, list[str]]:
 
 @lru_cache(maxsize=1)
 def _kept(command: bytes) -> tuple[argparse.Namespace, _Shown]:
-    """Options and what they show: a worker reads it once for all of its frames."""
+    """Options and their model, which a worker reads once for all of its frames."""
     options = argparse.Namespace(**pickle.loads(command))
     return options, _shown(options)
 
 
 def _shown(options: argparse.Namespace) -> _Shown:
-    """What a model's pictures show, and the scene source."""
+    """The pictures of a model, and their scene source."""
     source = _source(options)
     shown: _Animation
     if options.frames or options.shutter:
@@ -279,7 +279,7 @@ def _source(options: argparse.Namespace) -> SceneSource[Any]:
 
 
 def _require_encoder(path: Path) -> None:
-    """Raise ValueError if a package that writes a video is missing, before frames are rendered."""
+    """Raise ValueError before rendering if a package for videos is missing."""
     try:
         import imageio.v2  # noqa: F401 - only to find out whether it is there
 
@@ -294,7 +294,7 @@ def _require_encoder(path: Path) -> None:
 def _write_video(path: Path, frames: Sequence[Path], fps: float) -> None:
     import imageio.v2 as imageio
 
-    is_gif = path.suffix.lower() == ".gif"  # A GIF file repeats for ever, and its durations are milliseconds
+    is_gif = path.suffix.lower() == ".gif"  # GIF files loop for ever, with durations in milliseconds
     settings: dict[str, Any] = {"duration": 1000 / fps, "loop": 0} if is_gif else {"fps": fps, "macro_block_size": EVEN}
     with whole_file(path) as beside:
         video: Any = imageio.get_writer(beside, **settings)

@@ -1,4 +1,4 @@
-"""The command ``render``: its options, and what they cannot ask for together; `pictures` does the work."""
+"""The options of the command ``render`` and their checks; `pictures` renders."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from .pictures import (
 )
 
 IMAGE_SUFFIXES, SCENE_SUFFIX = (".exr", ".png", ".jpg", ".hdr"), ".xml"
-_OF_SCENES = ("parameters", "sensor", "share", "reference", "tolerances")  # Options about scenes in files
-# Suffixes of files that Blender converts to USD files.
+_OF_SCENES = ("parameters", "sensor", "share", "reference", "tolerances")  # Options for Mitsuba scenes
+# Suffixes of files that Blender can convert to USD.
 _OF_BLENDER = (".blend", ".fbx", ".gltf", ".glb", ".abc", ".dae", ".stl", ".3ds")
 SUB_FRAMES = 16  # In an interval
 _WITH_ALPHA = (".exr", ".png")
@@ -53,14 +53,14 @@ def _integers(separator: str) -> Callable[[str], tuple[int, ...]]:
 
 
 def _shutter_of(text: str) -> tuple[int, tuple[float, float] | None]:
-    """Number of sub-frames, and time codes from the frame to opening and closing; None for those of the camera."""
+    """Number of sub-frames, and opening and closing times relative to the frame; None for the camera's."""
     numbers = text.split(":")
     count = int(numbers[0] if len(numbers) == 1 else numbers[2] if len(numbers) == 3 else SUB_FRAMES)
     return count, None if len(numbers) == 1 else (float(numbers[0]), float(numbers[1]))
 
 
 def _environment_of(text: str) -> dict[str, Any]:
-    """Values of `Look` for an environment."""
+    """Fields of `Look` for an environment."""
     path, turn, strength = re.fullmatch(r"(.+?)(?:,turn=([^,]*))?(?:,strength=([^,]*))?", text).groups()  # type: ignore[union-attr]
     return {"environment": Path(path), "turn": float(turn or 0), "strength": float(strength or 1)}
 
@@ -172,7 +172,7 @@ def _render(options: argparse.Namespace) -> None:
     if not is_model and suffix != SCENE_SUFFIX and not options.scene.is_file():
         expected = f"a Mitsuba scene ({SCENE_SUFFIX}) or a model ({', '.join(FORMATS)})"
         raise ValueError(f'"{options.scene}" is not a file; expected {expected}')
-    # A worker of a cluster renders a frame as a whole.
+    # A worker of a cluster renders whole frames.
     on_cluster = options.dask and not (options.frames or options.turntable or options.shutter)
     by_passes = bool(options.share or options.passes or options.reference or on_cluster)
     _require_effect(options, is_model)
@@ -197,7 +197,7 @@ def _render(options: argparse.Namespace) -> None:
 
 
 def _stated_variant(options: argparse.Namespace) -> str | None:
-    """The variant that render settings of a stage ask for; None if they do not, or it cannot run here."""
+    """The variant of a stage's render settings; None if they have none, or it cannot run here."""
     if not is_stage(options):
         return None
     require_usd(f'"{options.scene}"')
@@ -215,7 +215,7 @@ def _require_effect(options: argparse.Namespace, is_model: bool) -> None:
     other = "a Mitsuba scene, which --save-scene writes" if is_model else "a model"
     for name in useless:
         given = getattr(options, name)
-        # An angle or a sensor may be 0.
+        # Angles and sensors may be 0.
         if given is not None and given is not False and given != []:
             flags = {"parameters": "-D", "share": "--pass", "tolerances": "--tolerance", "aovs": "--aov"}
             flag = flags.get(name, f"--{name.replace('_', '-')}")
@@ -223,7 +223,7 @@ def _require_effect(options: argparse.Namespace, is_model: bool) -> None:
 
 
 def _refuse_contradictions(options: argparse.Namespace, by_passes: bool) -> None:
-    """Refuse outputs of an unknown kind, and options that contradict each other or have no effect with the others."""
+    """Refuse outputs of an unknown format, and options that contradict each other or have no effect."""
     suffix, has_frames = options.output.suffix.lower(), options.turntable or options.frames
     has_other_filter = options.filter not in (None, BOX)
     all_options = "--pass, --passes, --dask or --reference"

@@ -1,8 +1,7 @@
 """Figures of the documentation, and the table that lists them.
 
-A new figure is a function ``draw_NAME`` and a line. The function gets `FigureOptions`, draws, and returns the files
-that it wrote. The line in the table says what the figure shows, and lists the options that change it. The command
-``figure`` and its help read this table.
+A new figure is a function ``draw_NAME`` and a line of the table. The function takes `FigureOptions` and returns the
+written files. The line describes the figure and lists its options, for the command ``figure`` and its help.
 """
 
 from __future__ import annotations
@@ -20,12 +19,12 @@ __all__ = ["FIGURES", "Figure", "FigureError", "FigureOptions", "require_options
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure; call it with `FigureOptions` to draw it, and get the files written."""
+    """A figure; a call with `FigureOptions` draws it and returns the written files."""
 
     name: str
-    module: str  # Has the function ``draw_NAME``, and imports Mitsuba: it is imported when the figure is drawn
+    module: str  # Module of ``draw_NAME``, imported when the figure is drawn, as it imports Mitsuba
     shows: str  # For the help
-    options: tuple[str, ...] = ()  # Names of options that change the figure, besides "resolution" and "width"
+    options: tuple[str, ...] = ()  # Options of the figure, besides "resolution" and "width"
     width: float = PAGE  # Default of the option
     spp: int = FigureOptions.spp  # Default of the option
     has_numbers: bool = False  # Whether the figure writes CSV
@@ -44,7 +43,7 @@ class Figure:
         module = importlib.import_module(f".{self.module}", __name__)
         draw: Callable[[FigureOptions], list[Path]] = getattr(module, f"draw_{self.name}")
         if options.cage:
-            # Warns about the cage, once: the figure makes others of it.
+            # Warns about the cage once, before the figure makes others of it.
             importlib.import_module(".staging", __name__).read(options.cage)
         with without_warnings():
             return draw(options)
@@ -71,7 +70,7 @@ FIGURES = {figure.name: figure for figure in _FIGURES}
 
 
 def require_options(name: str, given: dict[str, object], formats: Iterable[str]) -> None:
-    """Raise ValueError for options that have no effect on a figure, and formats that it does not have."""
+    """Raise ValueError for options and formats that a figure does not have."""
     figure = FIGURES[name]
     for option in given:
         if option not in (*figure.options, "resolution", "width"):

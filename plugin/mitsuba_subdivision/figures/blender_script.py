@@ -1,7 +1,7 @@
-"""The script that Blender runs to subdivide a cage by its modifier; nothing imports it.
+"""A script for Blender that subdivides a cage by its modifier; not imported by this package.
 
-``blender --background --python blender_script.py -- QUERIES ANSWERS LEVEL``, with files of JSON. It uses only Python's
-own library, since Blender of some distributions has no NumPy and none has this package.
+``blender --background --python blender_script.py -- QUERIES ANSWERS LEVEL``, with JSON files. It uses only Python's
+standard library, as some distributions of Blender have no NumPy.
 """
 
 import array
@@ -12,7 +12,7 @@ import bpy
 
 
 def main(queries, answers, level):
-    """Answer a cage with points, normals and corners of its mesh, as Blender shows it with smooth shading."""
+    """Write points, normals and corners of the smoothly shaded mesh that Blender makes of a cage."""
     with open(queries, encoding="utf-8") as file:
         cage = json.load(file)
     corners, faces = cage["corners"], []
@@ -24,7 +24,7 @@ def main(queries, answers, level):
     mesh.update()
     thing = bpy.data.objects.new("cage", mesh)
     bpy.context.scene.collection.objects.link(thing)
-    # Quality and the use of the limit surface stay at their defaults.
+    # Quality and Use Limit Surface have their defaults.
     thing.modifiers.new("subdivision", "SUBSURF").levels = level
     subdivided = thing.evaluated_get(bpy.context.evaluated_depsgraph_get()).to_mesh()
     answer = {"version": list(bpy.app.version)}

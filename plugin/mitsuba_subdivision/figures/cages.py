@@ -23,15 +23,15 @@ from . import staging
 from .output import FigureError, FigureOptions, panels, rows_of, show, write_figure
 
 LEVELS = 4
-RADIUS = 1.9  # The ball that fills the picture, for cages of users
+RADIUS = 1.9  # Of the ball that fills the picture, for cages of users
 REGULAR, IRREGULAR = (0.9, 0.9, 0.89), (0.22, 0.24, 0.27)
-# Segments of an edge of level 0, whose ends are tested for visibility; an edge of the next level has half as many.
+# Segments of an edge of level 0, for visibility tests at their ends; each next level has half as many.
 EDGE_SEGMENTS = 24
-RATE = 6  # Segments per edge of a patch of the last level, for its area and for the render of the limit surface
+RATE = 6  # Segments per edge of a patch of the last level, for areas and renders of the limit surface
 
 
 def draw_subdivision(options: FigureOptions) -> list[Path]:
-    """Draw a cage of 3-, 4-, 5- and 6-gons at levels 0 to 3, its irregular patches grey, and its limit surface."""
+    """Draw a cage of 3-, 4-, 5- and 6-gons at levels 0 to 3, with irregular patches in grey, and its limit surface."""
     stage = staging.load_stage("subdivision", resolution=options.resolution)
     cages = [ControlCage.from_file(example_file("cages/propeller.obj"))]
     if options.cage:
@@ -41,7 +41,7 @@ def draw_subdivision(options: FigureOptions) -> list[Path]:
     counts = {extraordinary_count(cage.topology) for cage in cages}
     if len(counts) != 1:
         raise FigureError(f"{sorted(counts)} extraordinary points at several levels; expected as many at each")
-    # Title and caption of each panel, its scene, and lines of some width and points on the surface there.
+    # Title, caption and scene of each panel, and lines and points on its surface.
     drawn = []
     for level, cage in enumerate(cages):
         limit = LimitSurface(cage)
@@ -78,7 +78,7 @@ def draw_subdivision(options: FigureOptions) -> list[Path]:
 
 
 def extraordinary_count(topology: Topology) -> int:
-    """Number of inner vertices of valence other than 4, and of faces but quads. A refinement keeps this number."""
+    """Number of inner vertices of valences other than 4 and of faces other than quads, which refinement keeps."""
     return int(_is_extraordinary(topology).sum() + (topology.face_sizes != 4).sum())
 
 
@@ -93,7 +93,7 @@ def regular_elements(surface: LimitSurface) -> NDArray[np.bool_]:
 
 
 def area_share(surface: LimitSurface, elements: NDArray[np.bool_]) -> float:
-    """Share of the chosen elements in the area of the limit surface."""
+    """Share of some elements in the area of the limit surface."""
     triangles = surface.tessellate(RATE)
     a, b, c = triangles.positions[triangles.triangles].swapaxes(0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -101,9 +101,9 @@ def area_share(surface: LimitSurface, elements: NDArray[np.bool_]) -> float:
 
 
 def _polyhedron(cage: ControlCage, regular: NDArray[np.bool_]) -> mi.Mesh:
-    """The cage with flat faces, which are grey unless they are regular."""
+    """The cage with flat faces, grey if they are irregular."""
     t = cage.topology
-    # Every face becomes a fan of triangles around its centre. Its vertices are its own, and have its normal.
+    # Every face becomes a fan of triangles around its centre, with separate vertices that have its normal.
     corners, centres = cage.positions[t.face_vertices], _centres(cage)
     cross = np.cross(corners - centres[t.face], corners[t.next] - centres[t.face])
     normals = np.add.reduceat(cross, t.face_offsets[:-1])
@@ -133,28 +133,28 @@ def edge_curves(surface: LimitSurface, half_edges: NDArray[np.integer], segments
 
 
 def _is_extraordinary(topology: Topology) -> NDArray[np.bool_]:
-    """``(n_v,)`` whether a vertex inside has another valence than 4."""
+    """``(n_v,)`` whether an inner vertex has a valence other than 4."""
     return (topology.vertex_face_count != 4) & ~topology.is_border_vertex
 
 
-# Panels of the figure of creases, and their titles.
+# Panels of the figure `creases`, and their titles.
 TITLES = {
     "smooth": "smooth\ntags ignored",
     "own": "semi-sharp\nthe cage's own tags",
     "infinite": "infinitely sharp\nevery crease",
 }
 CAGE_TITLE = "control cage"
-HEIGHT = 1.55  # Widths of a picture
+HEIGHT = 1.55  # Relative to the width of a picture
 CREASE_RATE, INFINITE = 24, 10
 LACQUER = {"roughness": 0.3, "specular": 0.5, "clearcoat": 0.6, "clearcoat_gloss": 0.95}
 MATERIAL = {"type": "principled", "base_color": {"type": "rgb", "value": [0.55, 0.30, 0.13]}, **LACQUER}
-# Colour of the cage's faces in sRGB; colour and radius of its edges, from this sharpness on. The cage is 2.7 high.
+# Colour of the cage's faces in sRGB; colour and radius of its edges by least sharpness. The cage is 2.7 high.
 PALE = "#e4e4e1"
 EDGES = {0: ("#9aa1ab", 0.006), 1: ("#f2a541", 0.014), 3: ("#2f8f83", 0.014), INFINITE: ("#5b2a86", 0.014)}
 
 
 def draw_creases(options: FigureOptions) -> list[Path]:
-    """Render a cage, and its Catmull-Clark surface without creases, with the cage's own, and with all of them sharp."""
+    """Render a cage, and its Catmull-Clark surfaces without creases, with them, and with infinitely sharp ones."""
     stage = staging.load_stage("creases", width=options.resolution, height=round(HEIGHT * options.resolution))
     cage = ControlCage.from_file(example_file("cages/rook.obj"))
     if options.cage:
@@ -171,7 +171,7 @@ def draw_creases(options: FigureOptions) -> list[Path]:
 
 
 def _tagged(cage: ControlCage, name: str) -> ControlCage:
-    """The cage without creases, with its own, or with all of them infinitely sharp, by a name in `TITLES`."""
+    """The cage without creases, with them, or with infinitely sharp ones, by a name in `TITLES`."""
     if name == "own":
         return cage
     creases = cage.tags.creases(cage.topology)
@@ -180,8 +180,8 @@ def _tagged(cage: ControlCage, name: str) -> ControlCage:
 
 
 def _cage_shapes(cage: ControlCage) -> SceneNode:
-    """Shapes of the cage: flat faces, and edges as rods, which are thick and coloured where they are creases."""
-    # Each triangle has three vertices of its own, so that no normals are averaged.
+    """Shapes of the cage: flat faces, and edges as rods, thick and coloured for creases."""
+    # Each triangle has separate vertices, so that no normals are averaged.
     corners = cage.positions[cage.triangles.ravel()]
     mesh = staging.make_mesh(corners, np.arange(len(corners)).reshape(-1, 3), staging.paint(PALE))
     t, half_edges = cage.topology, cage.topology.edge_half_edge
@@ -192,7 +192,7 @@ def _cage_shapes(cage: ControlCage) -> SceneNode:
 
 
 def labels(sharpness: NDArray[np.floating]) -> dict[int, str]:
-    """Ranges of the sharpness of creases by their least values in `EDGES`."""
+    """Labels of the ranges of sharpness that begin at the values in `EDGES`."""
     ranges = {}
     for least, end in itertools.pairwise([*EDGES, np.inf]):
         values = sharpness[(sharpness >= least) & (sharpness < end) & (sharpness > 0)]
@@ -204,10 +204,10 @@ def labels(sharpness: NDArray[np.floating]) -> dict[int, str]:
 
 def _draw_legend(axis: Axes, cage: ControlCage) -> None:
     shown = labels(cage.tags.edges)
-    # Squares, as a line before a number reads as a minus sign.
+    # Squares, as a line before a number looks like a minus sign.
     square = partial(Line2D, [], [], linestyle="none", marker="s", markersize=4)
     handles = [square(color=EDGES[least][0], label=label) for least, label in shown.items()]
     handles.insert(0, Line2D([], [], linestyle="none", label="sharpness"))
     spaces = {"handlelength": 0.9, "handletextpad": 0.3, "columnspacing": 0.9, "borderaxespad": 0.1}
     legend = axis.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0), ncols=len(handles), **spaces)
-    legend.set_in_layout(False)  # Captions of other panels reserve the room for it
+    legend.set_in_layout(False)  # Other panels' captions reserve its room

@@ -27,31 +27,31 @@ from ..surface import LimitSurface
 from .output import SERIES, FigureOptions, hide_frame, label_powers, panels, write_figure
 from .staging import around_vertices, frame, grid_points
 
-SIDE_POINTS = 24  # Each side of a polygon, which the map bends
+SIDE_POINTS = 24  # Points along each side of a polygon, which the map bends
 VALENCE, LEVELS = 5, 6
-# Size of labels at level 0 in points, per millimetre of the figure's width; those of other levels are smaller, as
-# their domains are. Indices are 0.7 times as large as labels, and 6 points at least.
+# Size of labels at level 0 in points per millimetre of the figure's width; other levels have smaller ones. Indices have
+# 0.7 times the size of labels, and at least 6 points.
 LABEL_SIZE, LEAST_LABEL = 0.175, 8.6
-# The irregular child is grey, as in the figure `subdivision`; in grey prints, all four differ.
+# The irregular child is grey, as in the figure `subdivision`; all four differ in greyscale.
 CHILD_COLOURS = ("#747b84", "#fcebbc", "#e39360", "#b3d3e0")
 CONTROL_EDGE, NEW_EDGE = "#8d97a1", "#3f5b6b"
-DECIMALS = 9  # Stencils that agree so far are the same: their entries are fractions of small integers
-VALENCES = (3, 4, 5, 4)  # Faces around the corners of the tree's face; two corners are extraordinary
-# Colours of regular leaves and of leaves at each level around an extraordinary vertex; grey for deeper ones.
+DECIMALS = 9  # Precision for equal stencils: their entries are fractions of small integers
+VALENCES = (3, 4, 5, 4)  # Of the corners of the face of `tree`; two are extraordinary
+# Colours of regular leaves and of leaves at each level around an extraordinary vertex; grey for deeper levels.
 LEAF_COLOURS, REST = ("#fcfcd0", "#b9dfa8", "#63b7b3", "#2a7fb0"), "#8d97a1"
-SLACK = 0.15  # Stiffness of springs along the edges of the tree's face, relative to other edges
+SLACK = 0.15  # Stiffness of springs along the edges of the face of `tree`, relative to other edges
 LINE = "#2d3a45"
 
 
 def patch_of_valence(scheme: Scheme, valence: int) -> IrregularPatch:
-    """The patch with one extraordinary point, at its parameters (0, 0), and regular faces and vertices around it."""
+    """The patch with one extraordinary point, at (0, 0), amid regular faces and vertices."""
     if (patch := irregular_patch(scheme, isolated_signature(scheme, valence))) is None:
         raise ValueError(f"valence {valence} is regular; expected an extraordinary one")
     return patch
 
 
 def characteristic_points(patch: IrregularPatch, valence: int) -> FloatArray:
-    """Control points ``(K, 2)`` of the characteristic map whose edges at (0, 0) are a regular star, from x on."""
+    """Control points ``(K, 2)`` of the characteristic map; edges at (0, 0) are a regular star that begins along x."""
     points, turn = patch.basis.vectors[:, 1:3], 2 * np.pi / valence
     begin, end = on_patch(patch.scheme, patch.signature, points, patch.scheme.domain.corners[[1, -1]])
     star = np.array([(1, 0), (np.cos(turn), np.sin(turn))]).T
@@ -59,7 +59,7 @@ def characteristic_points(patch: IrregularPatch, valence: int) -> FloatArray:
 
 
 def on_patch(scheme: Scheme, signature: Signature, points: FloatArray, uv: FloatArray) -> FloatArray:
-    """Points at parameters ``(s, 2)`` of the patch of a signature with these control points in the plane."""
+    """Points of a signature's patch at parameters ``(s, 2)``, for control points in the plane."""
     return np.asarray(element_stencils(scheme, signature, uv)[0] @ points, dtype=np.float64)
 
 
@@ -76,7 +76,7 @@ def outline(corners: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def sub_domain(domain: ParameterDomain, level: int, child: int) -> NDArray[np.float64]:
-    """Corners ``(m, 2)`` of the parameters of child ``child`` of the ``level``-th refinement at (0, 0)."""
+    """Corners ``(m, 2)`` of the parameters of a child of the ``level``-th refinement at (0, 0)."""
     outward = domain.children[child].inverse()
     for _ in range(level):
         outward = domain.children[0].inverse() @ outward
@@ -90,7 +90,7 @@ def draw_domains(options: FigureOptions) -> list[Path]:
     image = partial(on_patch, scheme, patch.signature, characteristic_points(patch, VALENCE))
     figure, axes = panels(options, 1, 2)
     flat, round_ = axes.flat
-    # Light enough at every level for black labels.
+    # Light enough for black labels at every level.
     colours = matplotlib.colormaps["YlGnBu"](np.linspace(0.03, 0.75, LEVELS))
 
     for level in range(LEVELS):
@@ -164,11 +164,11 @@ def draw_refinement(options: FigureOptions) -> list[Path]:
 
 
 def draw_tree(options: FigureOptions) -> list[Path]:
-    """Draw a face with two extraordinary vertices, its leaves, and the Bernstein coefficients of these as weights."""
+    """Draw a face with two extraordinary vertices, its leaves, and the weights of their Bernstein coefficients."""
     scheme = scheme_named("catmull_clark")
     signature = Signature("face", tuple(Fan((4,) * valence) for valence in VALENCES))
     tree, form, ring = patch_tree(scheme, signature), polynomial_basis(scheme), one_ring(signature)
-    # Map from the parameters of each leaf to those of the face; level, 0 for regular leaves; rows of weights
+    # Map from the parameters of each leaf to the face's; level, 0 for regular leaves; rows of weights
     leaves: list[tuple[ParameterMap, int, FloatArray]] = [
         (ParameterMap(*domain), 0, rows)
         for *domain, rows in zip(*tree.regular_domains, tree.coefficients(form.of_controls), strict=True)
@@ -197,7 +197,7 @@ def draw_tree(options: FigureOptions) -> list[Path]:
     colours = f"$K$ = {count} control points\ngrey: (10) and (12); red: (13)"
     face.set(title="a face and its one-ring,\nleaves of its patch tree", xlabel=colours)
     weights = np.concatenate([rows for *_, rows in leaves])
-    # Small weights are seen, too.
+    # Small weights are visible, too.
     matrix.imshow(weights, aspect="auto", cmap="Greys", norm=PowerNorm(0.5, 0, 1), interpolation="nearest")
     for number, (_, level, _) in enumerate(leaves):
         strip = {"xmin": -0.06, "xmax": -0.01, "clip_on": False, "linewidth": 0.2, "edgecolor": LINE}
@@ -209,15 +209,15 @@ def draw_tree(options: FigureOptions) -> list[Path]:
 
 
 def _in_the_plane(topology: Topology) -> FloatArray:
-    """Control points of a one-ring in the plane: the border on a circle, each other one amid its neighbours."""
+    """Control points of a one-ring in the plane: the border on a circle, other points amid their neighbours."""
     t = topology
     laplacian = np.zeros((t.vertex_count, t.vertex_count))
     start, end = t.face_vertices, t.face_vertices[t.next]
     laplacian[start, end] = laplacian[end, start] = -1
-    corners = t.face_vertices[: t.face_sizes[0]]  # The face is drawn large
+    corners = t.face_vertices[: t.face_sizes[0]]  # Makes the face large
     laplacian[np.ix_(corners, corners)] *= SLACK
     np.fill_diagonal(laplacian, -laplacian.sum(axis=1))
-    # Around the border, which begins at any of its half-edges.
+    # Around the border, from any of its half-edges.
     following = dict(zip(start[t.twin < 0].tolist(), end[t.twin < 0].tolist(), strict=True))
     border = [next(iter(following))]
     while (vertex := following[border[-1]]) != border[0]:
@@ -230,45 +230,45 @@ def _in_the_plane(topology: Topology) -> FloatArray:
     return points
 
 
-CURVATURE_VALENCES = (3, 5, 8)  # Vertices in the figure of curvature
+CURVATURE_VALENCES = (3, 5, 8)  # Of the figure `curvature`
 # The ball of `extraordinary` is bent by z += BEND (x^2 - y^2): principal curvatures of about 1 - 2 BEND and 1 + 2 BEND.
-# Without the bend, the symmetry of the ball would make the leading terms at the vertex vanish.
+# Without the bend, the leading terms at the vertex would vanish by symmetry.
 BEND = 0.35
-# Radius of the discs in the tangent plane, as a part of the largest that the elements at the vertex cover. Within
-# MIDDLE of it, curvature may grow without bound: it decides on no colours, and has no lines.
+# Radius of the discs in the tangent plane, relative to the largest disc in the elements at the vertex. Within MIDDLE of
+# it, where curvature may be unbounded, values do not affect colours, and there are no lines.
 RADIUS, MIDDLE = 0.95, 0.1
 LINEAR = 0.2  # Colours are linear up to this part of the largest curvature, then logarithmic
-# Lines of equal curvature as parts of the largest, up to the border between both signs: a little below zero, as a flat
-# surface has no border.
+# Lines of equal curvature relative to the largest, up to the border between both signs, slightly below zero, so that a
+# flat surface has no border.
 NEGATIVE = (-1 / 4, -1 / 16, -1e-3)
-FLAT = 1e-9  # Curvature below this is a rounding error, in reciprocals of the disc's radius
+FLAT = 1e-9  # Curvature below this, in reciprocals of the disc's radius, is a rounding error
 DEPTHS = np.arange(0, 41)
-# Samples of each level for the plot: near the middles of the three regular children, off their diagonals.
+# Samples of each level for the plot: near the middles of the three regular children, but off their diagonals.
 DIRECTIONS = np.array([(1.0, 0.3), (0.8, 0.7), (0.35, 1.0)])
 
 
 def bent_ball(valence: int) -> LimitSurface:
-    """The surface of the figure. Vertex 0 has the valence, and elements 0 to ``valence - 1`` lie around it."""
+    """The surface of the figure, with the valence at vertex 0 and elements 0 to ``valence - 1`` around it."""
     cage = extraordinary(valence)
     x, y, z = cage.positions.T
     return LimitSurface(cage.with_positions(np.stack([x, y, z + BEND * (x**2 - y**2)], axis=1)))
 
 
 def growth(valence: int) -> float:
-    """Factor by which curvature grows from level to level near the point: ``|lambda_4| / lambda_2^2``."""
+    """Growth of curvature per level near the point: ``|lambda_4| / lambda_2^2``."""
     patch = patch_of_valence(scheme_named("catmull_clark"), valence)
     return float(patch.basis.moduli[3] / patch.basis.subdominant**2)
 
 
 def curvature_map(surface: LimitSurface, valence: int, count: int) -> NDArray[np.floating]:
     """Coordinates x and y in the tangent plane, Gaussian and mean curvature around vertex 0, ``(4, valence, n, n)``."""
-    # From a thousandth of the element on. The point itself has no curvature, or one of no interest.
+    # From a thousandth of the element on, as the point itself has no useful curvature.
     uv = grid_points(np.concatenate([[0], np.geomspace(1e-3, 1, count)]))
     uv[0] = 1e-4
     samples = surface.evaluate(np.arange(valence)[:, None], uv, derivatives=2)
     point, axes, _ = frame(surface)
     x, y, _ = ((samples.p - point) @ axes).T
-    # Positive where the surface bends inward, as on a ball.
+    # Positive where the surface bends inward, like a ball.
     gaussian, mean = np.asarray(samples.gaussian_curvature), np.asarray(samples.mean_curvature)
     return np.stack([x, y, gaussian, -mean]).reshape(4, valence, count + 1, count + 1)
 
@@ -283,7 +283,7 @@ def largest_by_level(surface: LimitSurface, valence: int) -> NDArray[np.float64]
 
 
 def draw_curvature(options: FigureOptions) -> list[Path]:
-    """Draw maps of Gaussian and mean curvature around vertices, and its growth from level to level: a row for each."""
+    """Draw a row for each vertex: maps of Gaussian and mean curvature, and growth of curvature by level."""
     surfaces = {f"valence {valence}": bent_ball(valence) for valence in CURVATURE_VALENCES}
     if options.cage:
         cages = around_vertices(options.cage, len(CURVATURE_VALENCES))
@@ -328,7 +328,7 @@ def _draw_disc(axis: Axes, grids: tuple[NDArray[np.floating], ...], largest: flo
         shown = axis.pcolormesh(x, y, value, norm=norm, cmap="PuOr_r", shading="gouraud", rasterized=True)
         shown.set_clip_path(disc)
         axis.plot(x[0], y[0], color="black", linewidth=0.3, alpha=0.6, clip_path=disc)
-        # In grey, both ends of the colours are dark: lines of negative curvature are dashed.
+        # In greyscale, both ends of the colours are dark, so lines of negative curvature are dashed.
         lined = np.where(np.hypot(x, y) < MIDDLE * radius, np.nan, value)
         levels = largest * np.array(NEGATIVE)
         lines = axis.contour(x, y, lined, levels, colors="black", linewidths=0.4, linestyles=("--", "--", "-"))

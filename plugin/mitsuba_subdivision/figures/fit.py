@@ -1,4 +1,4 @@
-"""Cages fitted to pictures: a ball on its way to a shape with arms, beside a dense mesh, and a box with its creases."""
+"""Cages fitted to pictures: a ball to a shape with arms, as a cage and as a dense mesh, and a box with creases."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ from ..variants import SceneNode, threads_set
 from .output import BETWEEN, SERIES, FigureError, FigureOptions, panels, write_figure
 from .staging import camera_matrix, edge_rods, limit_surface, load_stage, make_mesh, project, render_panels, staged
 
-# Steps of all fits; pictures, their pixels, samples, and samples of the target's pictures.
+# Steps of all fits; number, pixels and samples of the pictures, and samples of the target's pictures.
 STEPS, CREASE_STEPS = 100, 100
 VIEWS, PIXELS, BOX_PIXELS, SPP, EDGE_SPP, TARGET_SPP = 8, 80, 64, 16, 2, 256
-CORE, SHARPNESS_OF_ARMS = 0.45, 9  # Radius of the target's core, and how fast its arms end to their sides
+CORE, SHARPNESS_OF_ARMS = 0.45, 9  # Radius of the target's core, and steepness of its arms' sides
 RADIUS, DIAGONAL = 0.6, 2.2  # The initial ball, and the target's box
-COARSE, DENSE, FINE = 2, 5, 6  # How often a cube is halved to be the cage, the mesh, and the target
-# λ of large steps, and Adam's first and last learning rates, in diagonals: the best of several.
+COARSE, DENSE, FINE = 2, 5, 6  # Halvings of a cube for the cage, the mesh and the target
+# λ of large steps, and Adam's first and last learning rates in diagonals: the best of several.
 SMOOTHING, MESH_SMOOTHING = 1.0, 19.0
 RATES, MESH_RATES = (0.1, 0.006), (0.25, 0.01)
-# How often distances are measured; samples of each surface, and segments of a cage's edges there.
+# Number of distance measurements; samples of each surface, and segments of a cage's edges for these.
 MEASUREMENTS, SAMPLES, SEGMENTS = 16, 30_000, 6
-REFINED, SHOWN = 0.3, (0.09, 0.29)  # Parts of the steps before the cage is refined, and shown on its way
+REFINED, SHOWN = 0.3, (0.09, 0.29)  # Fractions of the steps at which the cage is refined, and shown
 
-SIDE, SIDES = 1.24, (1.25, 1.0, 0.85)  # Sides of the initial cube, and of the box as multiples
-# Sharpness of the box's edges: around its top, between top and bottom, and around its bottom; of all edges at first.
+SIDE, SIDES = 1.24, (1.25, 1.0, 0.85)  # Side of the initial cube, and sides of the box relative to it
+# Sharpness of the box's edges around its top, between top and bottom, and around its bottom; initial sharpness.
 TOP, UPRIGHT, BOTTOM, FIRST, HIGHEST = 2.4, 1.5, 0.5, 0.5, 3
 BOX_RATES, SHARPNESS_RATES = (0.02, 0.001), (0.3, 0.02)
-BOX_RATE, RATE = 8, 16  # Segments of the cages' edges in pictures of the fit of the box, and in renders
+BOX_RATE, RATE = 8, 16  # Segments of the cages' edges in the fit of the box, and in renders
 
 BALL_VIEW, BOX_VIEW = 11.5, 15.5  # Fields of view
 GREY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}}
@@ -64,15 +64,15 @@ GLAZE = {"roughness": 0.36, "specular": 0.5, "clearcoat": 1.0, "clearcoat_gloss"
 CLAY = {"type": "principled", "base_color": {"type": "rgb", "value": [0.74, 0.24, 0.07]}, **GLAZE}
 RODS = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.62, 0.66, 0.70]}}
 ROD_RADIUS = 0.009
-# Radius of a crease in the pictures of the box: at sharpness 0, and more for each 1.
+# Radius of a crease in the pictures of the box: at sharpness 0, and increment per unit.
 CREASE_RADIUS, CREASE_GROWTH = 0.010, 0.010
 SHARPNESS_COLOURS = ("#9aa1ab", "#f2a541", "#2f8f83", "#5b2a86")
 LABELS = {"cage": "cage", "refined": "coarse to fine", "mesh": "dense mesh"}
-LABEL = "#343d46"  # Behind numbers, as dark as the backdrop
+LABEL = "#343d46"  # Background of numbers, as dark as the backdrop
 
-Panel = tuple[str, SceneNode]  # A title of two lines, and shapes to be rendered
-Box = tuple[ControlCage, NDArray[np.float64]]  # A box and the sharpness of its edges, those of `cube` in their order
-# The course of a fit: the loss before each step, and cages or triangles of a mesh after some steps.
+Panel = tuple[str, SceneNode]  # A title of two lines, and shapes to render
+Box = tuple[ControlCage, NDArray[np.float64]]  # A box and the sharpness of its edges, in the order of `cube`'s
+# Course of a fit: the loss before each step, and cages or triangles after some steps.
 Course = tuple[list[float], dict[int, ControlCage]]
 
 
@@ -80,7 +80,7 @@ def draw_fit(options: FigureOptions) -> list[Path]:
     """Fit the cages and the mesh, and draw the results."""
     if "_ad_" not in str(mi.variant()):
         raise FigureError(f"the figure fits surfaces: variant {mi.variant()}; expected one with derivatives")
-    # With several threads, the order of gradient sums, and so every later step, is not reproducible.
+    # With several threads, the order of gradient sums, and so every later step, would be random.
     with threads_set(1):
         shape = _target()
         views = _views_of(make_mesh(shape.positions, shape.triangles, GREY), PIXELS)
@@ -88,7 +88,7 @@ def draw_fit(options: FigureOptions) -> list[Path]:
         courses["mesh"] = _fit_mesh(views)
         boxes, sharpness = _fit_creases()
 
-    # Twelve panels: pictures of the ball and of the box, in rows that plots of their fits complete.
+    # Twelve panels: a row of pictures and plots for the ball, and one for the box.
     is_page = options.width >= BETWEEN
     figure, axes = panels(options, *((3, 4) if is_page else (4, 3)))
     of_balls, of_boxes, left = _ball_panels(shape, courses), _box_panels(boxes), list(axes.flat)
@@ -171,7 +171,7 @@ def _fit_cage(refine: list[int], views: list[View]) -> Course:
 
 
 def _fit_mesh(views: list[View]) -> Course:
-    """Fit a dense mesh of triangles, in the same way but for the surface."""
+    """Fit a dense mesh of triangles in the same way."""
     ball = ball_cage(DENSE, RADIUS)
     mesh = ControlCage(ball.positions, ball.triangles)
     shape = make_mesh(mesh.positions, ball.triangles, GREY)
@@ -203,7 +203,7 @@ def _fit_mesh(views: list[View]) -> Course:
 
 
 def _fit_creases() -> tuple[list[Box], NDArray[np.float64]]:
-    """Fit a box; returns target, start and result, and the sharpness of edges after each step, ``(steps + 1, 12)``."""
+    """Fit a box. Returns target, start and result, and the sharpness of edges after each step, ``(steps + 1, 12)``."""
     edges, z = cube().edges, cube().positions[cube().edges, 2]
     truth = np.where(z.min(axis=1) > 0, TOP, np.where(z.max(axis=1) < 0, BOTTOM, UPRIGHT))
     sharpness = [np.full(len(edges), FIRST)]
@@ -231,7 +231,7 @@ def _fit_creases() -> tuple[list[Box], NDArray[np.float64]]:
 
 
 def distances(target: ControlCage, cages: Sequence[ControlCage]) -> NDArray[np.float64]:
-    """Chamfer's distances of surfaces, or of cages of triangles as they are, to a target's triangles, in diagonals."""
+    """Chamfer distances of surfaces, or of triangle meshes, to a target's triangles, in diagonals."""
     points = mesh_samples(target.positions, target.triangles, SAMPLES, 0)[0]
     tree = cKDTree(points)
     measured = []
@@ -244,7 +244,7 @@ def distances(target: ControlCage, cages: Sequence[ControlCage]) -> NDArray[np.f
 
 
 def _ball_panels(shape: ControlCage, courses: Mapping[str, Course]) -> list[Panel]:
-    """Panels of the first row: the target, the refined cage on its way, and the dense mesh."""
+    """Panels of the first row: the target, the refined cage during the fit, and the dense mesh."""
     cages, mesh = courses["refined"][1], courses["mesh"][1][STEPS]
 
     def title(name: str, step: int, cage: ControlCage) -> str:
@@ -262,7 +262,7 @@ def _ball_panels(shape: ControlCage, courses: Mapping[str, Course]) -> list[Pane
 
 
 def _rods(cage: ControlCage) -> mi.Shape:
-    """A cage's edges as rods: a file of curves, which has both ends of each edge, and an empty line."""
+    """A cage's edges as rods, by a file of curves with both ends of each edge and an empty line."""
     ends = cage.positions[cage.edges].tolist()
     curves = ("\n".join(f"{x:.6f} {y:.6f} {z:.6f} {ROD_RADIUS}" for x, y, z in edge) for edge in ends)
     with tempfile.TemporaryDirectory() as folder:
@@ -276,7 +276,7 @@ def _box_panels(boxes: Sequence[Box]) -> list[Panel]:
     found = f"found\n{VIEWS * CREASE_STEPS:,} renders"
     titles = "target\nthree kinds\nof creases", f"start\nall creases\n{FIRST:g}", found
     for title, (cage, sharpness) in zip(titles, boxes, strict=True):
-        # Rods are thicker, and of another colour, where creases are sharper.
+        # Sharper creases have thicker rods of another colour.
         looks = [(_sharpness_colour(value), CREASE_RADIUS + CREASE_GROWTH * value) for value in sharpness.tolist()]
         rods = edge_rods(cage, cube().edges, sharpness, looks)
         shown.append((title, {"surface": limit_surface(cage, RATE, CLAY), **rods}))
@@ -284,7 +284,7 @@ def _box_panels(boxes: Sequence[Box]) -> list[Panel]:
 
 
 def _sharpness_colour(sharpness: float) -> tuple[float, float, float]:
-    """Colour in sRGB between those of `SHARPNESS_COLOURS`, for 0 to the highest sharpness."""
+    """Interpolated colour in sRGB of `SHARPNESS_COLOURS`, for 0 to the highest sharpness."""
     return to_rgb(LinearSegmentedColormap.from_list("sharpness", SHARPNESS_COLOURS)(sharpness / HIGHEST))
 
 
@@ -310,7 +310,7 @@ def _plot_sharpness(axis: Axes, truth: FloatArray, sharpness: FloatArray) -> Non
 
 
 def _finish(axis: Axes, quantity: str, *, is_logarithmic: bool = False) -> None:
-    """Label a plot; logarithmic axes by 1, 2 and 5, without powers."""
+    """Label a plot, with 1, 2 and 5 in place of powers on logarithmic axes."""
     axis.set(title=quantity, xlabel="renders", box_aspect=1, axisbelow=True)
     axis.grid()
     if is_logarithmic:
@@ -329,7 +329,7 @@ def _label(axis: Axes, sensor: mi.Sensor, cage: ControlCage, sharpness: FloatArr
 
 
 def in_front(box: ControlCage, camera: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether one of the two faces of each edge of a box is turned to the camera."""
+    """Whether one of the two faces at each edge of a box faces the camera."""
     faces = box.face_vertices.reshape(-1, 4)
     a, b, c = (box.positions[faces[:, corner]] for corner in range(3))
     is_turned = ((camera - a) * np.cross(b - a, c - a)).sum(axis=1) > 0

@@ -33,17 +33,17 @@ from .characteristic import patch_of_valence
 from .output import BETWEEN, SERIES, FigureError, FigureOptions, label_powers, panels, scientific, show, write_figure
 from .peers import osd_peer, osd_samples
 
-# Vertices within this radius of the extraordinary vertex show their normals, as needles of this length.
+# Radius around the extraordinary vertex in which vertices show normals, and length of these needles.
 NEEDLE_RADIUS, NEEDLE_LENGTH = 0.3, 0.07
-EDGE_RADIUS = 0.8  # Edges of the cage that begin within this radius of the extraordinary vertex are drawn
+EDGE_RADIUS = 0.8  # Radius around the extraordinary vertex in which edges of the cage are drawn
 LOST = 2.0**-23 / 3  # lambda_2^n at the sample of a user's cage: eps |c1| / lambda_2^n is 30
 DISTANCE = 10  # From the origin to the extraordinary point
 CLAY = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.72, 0.66, 0.58]}}
-TURNS = Rotation.random(20, random_state=19).as_matrix()  # Directions of the figures' own cages
-# By scheme and valence: the u = v at which the extraordinary point is sampled, and the tessellation rate. At |c1| = 10
-# and about these u = v, float32 loses the normal: its error is about eps |c1| / lambda_2^n, where the subdominant
-# eigenvalues are 0.41 and 0.55 (Catmull-Clark), 0.25 and 0.45 (Loop), 0.5 (Doo-Sabin). The smaller these are, the
-# closer to the point lie samples of the same u and v. The rates make the triangles there about equally large.
+TURNS = Rotation.random(20, random_state=19).as_matrix()  # Rotations of the figures' own cages
+# u = v of the sample at the extraordinary point, and tessellation rate, by scheme and valence. At |c1| = 10 and about
+# these u = v, float32 loses the normal: its error is about eps |c1| / lambda_2^n, where the subdominant eigenvalues are
+# 0.41 and 0.55 (Catmull-Clark), 0.25 and 0.45 (Loop), 0.5 (Doo-Sabin). For smaller ones, samples of the same u and v
+# are closer to the point. The rates make triangles there about equally large.
 ROWS = {
     ("catmull_clark", 3): (1e-6, 3),
     ("catmull_clark", 5): (1e-8, 4),
@@ -52,7 +52,7 @@ ROWS = {
     ("doo_sabin", 3): (1e-7, 4),
     ("doo_sabin", 5): (1e-7, 4),
 }
-# Title, evaluator, and whether samples lie beside the extraordinary point rather than at it; all in float32.
+# Title, evaluator, and whether samples lie beside the extraordinary point; all in float32.
 RULES: tuple[tuple[str, Evaluator, bool], ...] = (
     ("Stam's form (11)", "stam", True),
     ("stabilised (12)", "stabilized", True),
@@ -67,7 +67,7 @@ def surface_of(scheme: str, valence: int) -> LimitSurface:
 
 
 def vertex_normal(surface: LimitSurface, evaluator: Evaluator, offset: float) -> tuple[int | None, float, float]:
-    """Level (None at the point itself), |c1|, and error of the normal in degrees, of float32 at ``u = v = offset``."""
+    """Level (None at the point itself), |c1|, and error of the float32 normal in degrees at ``u = v = offset``."""
     uv = np.full((1, 2), offset)
     single = surface.evaluate(0, uv, evaluator=evaluator, dtype=np.float32)
     double = surface.evaluate(0, uv)
@@ -77,12 +77,12 @@ def vertex_normal(surface: LimitSurface, evaluator: Evaluator, offset: float) ->
 
 
 def turned(cage: ControlCage) -> list[ControlCage]:
-    """The cage in several directions. In its own, zeros of its symmetry may hide errors."""
+    """The cage in several rotations. Unrotated, zeros of its symmetry may hide errors."""
     return [cage.with_positions(cage.positions @ turn.T) for turn in TURNS]
 
 
 def of_user(path: Path, scheme: str, most: int) -> dict[str, list[ControlCage]]:
-    """A user's cage by its vertices, not turned, with edges at the vertex as long as the figures' own."""
+    """A user's cage for each of its vertices, unrotated, with edges at the vertex as long as the figures' own."""
     if scheme != "catmull_clark":
         raise FigureError(f"--cage together with --scheme {scheme}; expected catmull_clark")
     length = staging.frame(surface_of(scheme, 5))[2]
@@ -93,13 +93,13 @@ def of_user(path: Path, scheme: str, most: int) -> dict[str, list[ControlCage]]:
 
 
 def error_at_vertex(surface: LimitSurface, rate: int, evaluator: Evaluator, offset: float) -> float:
-    """Error in degrees of the normal that vertex 0 of a tessellation has, as it is rendered."""
+    """Error in degrees of the rendered normal of vertex 0."""
     normal = surface.tessellate(rate, evaluator, np.float32, offset).normals[0]
     return float(normal_angle(normal, surface.evaluate(0, np.full((1, 2), offset)).n[0]))
 
 
 def draw_artifact(options: FigureOptions) -> list[Path]:
-    """Render valences 3 and 5 with vertex normals by (11), (12) and (13): columns differ in nothing else."""
+    """Render valences 3 and 5 with vertex normals by (11), (12) and (13), the only difference of the columns."""
     scheme, (_, rate) = options.scheme, ROWS[options.scheme, 5]
     rows = {f"valence {n}": (turned(surface_of(scheme, n).cage), *ROWS[scheme, n]) for n in VALENCES}
     if options.cage:
@@ -111,7 +111,7 @@ def draw_artifact(options: FigureOptions) -> list[Path]:
     for (name, (cages, beside, rate)), row_axes in zip(rows.items(), axes, strict=True):
         surfaces = [LimitSurface(offset_cage(cage, DISTANCE, scheme), scheme) for cage in cages]
         surfaces.sort(key=lambda surface: error_at_vertex(surface, rate, "stam", beside))
-        # The errors are those of this cage, which only its transform puts before the camera.
+        # Errors of this cage, which its transform moves to the camera.
         shown = surfaces[len(surfaces) // 2]
         to_world = staging.motion(here := staging.frame(shown), (*place[:2], here[2]))
         common = {"scheme": scheme, "to_world": mi.ScalarTransform4f(to_world.tolist())}
@@ -136,7 +136,7 @@ def draw_artifact(options: FigureOptions) -> list[Path]:
 
 
 def _lost_at(cage: ControlCage) -> float:
-    """The u = v at which Stam's form has lost the normal, at |c1| = 10 as in `ROWS`."""
+    """The u = v at which Stam's form loses the normal, at |c1| = 10 as in `ROWS`."""
     patch = patch_of_valence(scheme_named("catmull_clark"), int(cage.topology.vertex_face_count[0]))
     return float(f"{0.5 ** (np.log(LOST) / np.log(patch.basis.subdominant)):.0e}")
 
@@ -151,19 +151,19 @@ def _draw_lines(axis: Axes, sensor: mi.Sensor, surface: LimitSurface, mesh: Tess
     width, height = sensor.film().crop_size()
     axis.set(xlim=(0, width), ylim=(height, 0))
     needles, edges = (staging.project(sensor, staging.moved(points, to_world)) for points in (needles, edges))
-    # The needle of the extraordinary vertex comes first.
+    # The first needle is that of the extraordinary vertex.
     first, *others = needles
     axis.add_collection(LineCollection(list(edges), colors="#40362a", linewidths=0.3, alpha=0.4))
     axis.add_collection(LineCollection(others, colors="#1c4f72", linewidths=0.6, capstyle="round"))
     axis.add_collection(LineCollection([first], colors="#d8452a", linewidths=1.5, capstyle="round"))
 
 
-# Panels and levels of the plot of errors.
+# Panels and levels of the figure `error`.
 VALENCES, OFFSETS = (3, 5), (0, 1, 100)
 LEVELS = np.arange(61)
-# Directions of the samples at each level: one in each regular child, and one on the line between two.
+# Parameter directions of the samples of a level: one in each regular child, and one between two of them.
 DIRECTIONS = np.array([(1.0, 0.25), (0.75, 0.75), (0.25, 0.75), (1.0, 0.5)])
-# Digits of the exact arithmetic: differences at level 60, of size 0.41^60 = 1e-23, keep twenty digits and more.
+# Digits of the exact arithmetic: differences at level 60, about 0.41^60 = 1e-23, keep at least twenty digits.
 DIGITS = 60
 EQUATIONS: dict[Evaluator, str] = {"stam": "(11) Stam", "stabilized": "(12) stabilised", "limit": "(13) limit"}
 PRECISIONS = {np.float32: "-", np.float64: "--"}
@@ -191,7 +191,7 @@ def draw_error(options: FigureOptions) -> list[Path]:
 
 
 def _draw_panel(axis: Axes, cages: list[ControlCage], offset: float) -> list[tuple[object, ...]]:
-    """Plot the largest errors of turned cages; returns name, level and error of each point."""
+    """Plot the largest errors over rotated cages; returns name, level and error of each point."""
     numbers: list[tuple[object, ...]] = []
     rounded, unrounded = ([offset_cage(cage, offset, dtype=dtype) for cage in cages] for dtype in PRECISIONS)
     exact = [exact_normals(cage) for cage in rounded]
@@ -215,12 +215,12 @@ def _draw_panel(axis: Axes, cages: list[ControlCage], offset: float) -> list[tup
 
 
 def offset_cage(cage: ControlCage, offset: float, scheme: str | None = None, dtype: Any = np.float32) -> ControlCage:
-    """A cage, moved so that the limit point of vertex 0 has this distance from the origin, and rounded."""
+    """A cage, moved until the limit point of vertex 0 has this distance from the origin, and rounded."""
     limit = LimitSurface(cage, scheme).evaluate(0, [[0.0, 0.0]]).p[0]
-    # A direction that favours no axis, and is neither normal nor tangent to the surface.
+    # A direction along no axis, neither normal nor tangential to the surface.
     direction = np.array([0.48, 0.6, 0.64])
     moved = cage.positions - limit + offset * direction
-    # Every evaluator gets the same numbers.
+    # All evaluators start from the same numbers.
     return cage.with_positions(moved.astype(dtype).astype(np.float64))
 
 
@@ -228,13 +228,13 @@ def normal_errors(cage: ControlCage, exact: FloatArray, evaluator: Evaluator, dt
     """Largest error of computed normals in degrees over the samples of each level: ``(levels,)``."""
     uv = (np.ldexp(1.0, -LEVELS)[:, None, None] * DIRECTIONS).reshape(-1, 2)
     normals = LimitSurface(cage).evaluate(0, uv, evaluator=evaluator, dtype=dtype).n.astype(np.float64)
-    # Where derivatives came out parallel or zero, there is no normal. That counts as the largest error.
+    # Parallel or zero derivatives give no normal, which counts as the largest error.
     angle = np.nan_to_num(normal_angle(normals, exact), nan=180)
     return angle.reshape(len(LEVELS), -1).max(axis=1)
 
 
 def exact_normals(cage: ControlCage) -> NDArray[np.float64]:
-    """Normals of the samples of all levels at vertex 0, from ``A^n C`` in 60-digit arithmetic: ``(levels * 4, 3)``."""
+    """Exact normals of the samples of all levels at vertex 0, by ``A^n C`` with 60 digits: ``(levels * 4, 3)``."""
     scheme = scheme_named("catmull_clark")
     patch = patch_of_valence(scheme, int(cage.topology.vertex_face_count[0]))
     # Vertex 0 is the first corner of face 0.
@@ -259,14 +259,14 @@ def exact_normals(cage: ControlCage) -> NDArray[np.float64]:
 
 
 def _exactly(table: NDArray, row_sum: int | None = None) -> NDArray[np.object_]:
-    """Decimals of a table. Rows get a sum exactly, by their first entry: rounding would add up over the levels."""
+    """Decimals of a table. The first entry of a row corrects its sum, as rounding would add up over the levels."""
     exact = np.vectorize(Decimal, otypes=[object])(table)
     if row_sum is not None:
         exact[:, 0] += row_sum - exact.sum(axis=1)
     return exact
 
 
-# The zoom shows a vertex with normals by (11), by (12), and by OpenSubdiv where `osd_peer` is found.
+# The figure `zoom` shows normals by (11), by (12), and by OpenSubdiv if `osd_peer` is found.
 ZOOM_VALENCE, ZOOM_OFFSET = 5, 10
 MAGNIFICATIONS = (1, 100, 10_000, 1_000_000)
 OPENSUBDIV_LEVEL = 10  # Patch tables cannot isolate extraordinary vertices at deeper levels
@@ -276,22 +276,22 @@ METHODS: dict[Method, str] = {
     "opensubdiv": f"OpenSubdiv\nlevel {OPENSUBDIV_LEVEL}",
     "stabilized": EQUATIONS["stabilized"],
 }
-# Half the width of the image at magnification 1: the elements at the point just fill it. The cage has the radius 1.
+# Half the width of the image at magnification 1, filled by the elements at the point. The cage has the radius 1.
 HALF_WIDTH, BAR = 0.19, 0.1
-# Range of the colours in degrees. Below the least error, float32 cannot tell most unit vectors from the exact ones.
+# Range of the colours in degrees. Errors below it are rounding of unit vectors in float32.
 LEAST_ERROR, MOST_ERROR = 1e-6, 100
 COLOURS, ERROR_SCALE = "magma_r", LogNorm(LEAST_ERROR, MOST_ERROR, clip=True)
 LINE_POINTS = 33
 
 
 def on_stage(surface: LimitSurface, points: NDArray[np.floating], magnification: float) -> NDArray[np.float64]:
-    """Points on the stage, seen along the normal of vertex 0, where the image reaches from -1 to 1."""
+    """Points on the stage, seen along the normal of vertex 0; the image covers -1 to 1."""
     point, axes, _ = staging.frame(surface)
     return (points - point) @ axes * (magnification / HALF_WIDTH)
 
 
 def draw_zoom(options: FigureOptions) -> list[Path]:
-    """Draw a vertex of valence 5 at four magnifications: rendered, and the errors of normals, too small for shades."""
+    """Draw a vertex of valence 5 at four magnifications: renders, and errors of normals."""
     surface = LimitSurface(offset_cage(turned(extraordinary(ZOOM_VALENCE))[0], ZOOM_OFFSET))
     stage, resolution = staging.load_stage("zoom", resolution=options.resolution), options.resolution
     sensor, count = stage.sensors()[0], max(resolution // 2, 8)
@@ -301,7 +301,7 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
     rendered, records = [], []
     for magnification, column in zip(MAGNIFICATIONS, axes.T, strict=True):
         samples = panel_samples(surface, magnification, count)
-        # The sample of all elements that is nearest to the centre of each pixel, ``(height, width)``
+        # Index of the nearest sample to the centre of each pixel, ``(height, width)``
         points = samples[1].reshape(-1, 3)
         centres = staging.grid_points(np.arange(resolution) + 0.5).reshape(resolution, -1, 2)
         nearest = np.asarray(cKDTree(staging.project(sensor, points)).query(centres)[1])
@@ -314,7 +314,7 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
             rendered.append(staging.render(staging.staged(stage, mesh=mesh), options, name))
             _draw_halves(axis, rendered[-1], errors.ravel()[nearest], lines)
             axis.set_xlabel(_degrees(median))
-            # The length of the scale bar is one on the surface, whose cage has the radius 1.
+            # The scale bar is a length on the surface, whose cage has the radius 1.
             length = BAR / HALF_WIDTH / 2 * resolution
             bar = AnchoredSizeBar(axis.transData, length, scientific(BAR / magnification), "lower left", pad=0.2, sep=2)
             bar.patch.set(alpha=0.85, linewidth=0)
@@ -333,16 +333,16 @@ def draw_zoom(options: FigureOptions) -> list[Path]:
 
 
 def parameter_extent(magnification: float) -> float:
-    """Largest u and v that a panel shows: distances from the point are proportional to ``u ** -log2(lambda_2)``."""
+    """Largest u and v in a panel: distances from the point are proportional to ``u ** -log2(lambda_2)``."""
     patch = patch_of_valence(scheme_named("catmull_clark"), ZOOM_VALENCE)
     return float(magnification ** (1 / np.log2(patch.basis.subdominant)))
 
 
 def panel_samples(surface: LimitSurface, magnification: float, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Samples of a grid of ``count`` segments along each side, in every element at the point as far as a panel shows.
+    """Samples of a grid of ``count`` segments along each side in a panel's part of every element at the point.
 
-    Returns parameters ``(s, 2)``; positions on the stage and normals, in float64, ``(valence, s, 3)`` each: this far
-    from the origin, float32 cannot tell the points of the last panels apart.
+    Returns parameters ``(s, 2)``, and positions on the stage and normals, ``(valence, s, 3)`` float64 each, as points
+    of the last panels coincide in float32.
     """
     uv = staging.grid_points(np.linspace(0, 1, count + 1))
     uv[0] = 0.1 / count  # Stam's form has no value at the point itself
@@ -362,7 +362,7 @@ def normals_by(surface: LimitSurface, samples: tuple[FloatArray, ...], method: M
     else:
         raise FigureError("the program osd_peer is gone; expected it where it was found before")
     normals = np.nan_to_num(normals).reshape(exact.shape)
-    # Where derivatives are parallel or vanish, there is no normal. That counts as the largest error.
+    # Parallel or zero derivatives give no normal, which counts as the largest error.
     angle = np.where(normals.any(axis=-1), normal_angle(normals, exact), 180)
     inside = np.abs(positions[..., :2]).max(axis=-1) < 1
     return normals, angle, float(np.median(angle[inside]))
@@ -373,7 +373,7 @@ def _level_lines(surface: LimitSurface, magnification: float) -> NDArray[np.floa
     along = np.linspace(0, 1, LINE_POINTS)
     line = np.stack([np.ones_like(along), along], axis=1)
     extent = parameter_extent(magnification)
-    # The lines u = 1/2^n and v = 1/2^n of every level n that the image resolves.
+    # Lines u = 1/2^n and v = 1/2^n of the levels n that the image resolves.
     first = int(np.floor(-np.log2(extent))) - 1
     sides = 2.0 ** -np.arange(max(first, 0), first + 7)[:, None, None]
     axis = np.stack([along, np.zeros_like(along)], axis=1) * extent

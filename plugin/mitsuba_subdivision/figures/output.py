@@ -1,4 +1,4 @@
-"""Parts that all figures share: their options, matplotlib, and how files are written."""
+"""Common parts of all figures: options, layout, and output of files."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# Widths of a page and of one of its two columns in millimetres. Panels get fewer columns below BETWEEN.
+# Widths of a page and of one of its two columns in millimetres. Below BETWEEN, there are fewer panels in a row.
 PAGE, COLUMN, BETWEEN, INCH = 178.0, 84.0, 120.0, 25.4
-PAD, LAYOUTS = 0.02, 8  # Room around a figure in inches, and how often it is laid out to leave no more than this
-# Sizes of text in points at a column and at a page: exponents and indices are characters of the same size.
+PAD, LAYOUTS = 0.02, 8  # Room around a figure in inches, and number of layouts until it fits
+# Sizes of text in points for a column and for a page; exponents and indices are characters of the same size.
 TEXT_SIZES = (6.0, 7.0)
-# Colours and markers of series, which differ in grey and for colour-blind readers. None is red, the colour of
-# extraordinary points.
+# Colours and markers of series, distinguishable in greyscale and by colour-blind readers. Red is for extraordinary
+# points.
 SERIES = (("#2f8f83", "s"), ("#12395c", "o"), ("#d9a53f", "^"))
 STYLE: dict[Any, Any] = {
     "pdf.fonttype": 42,
@@ -58,7 +58,7 @@ _EXPONENTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 class FigureError(RuntimeError):
-    """A figure cannot be drawn: something it needs is missing."""
+    """A figure cannot be drawn, as a requirement is missing."""
 
 
 @dataclass(frozen=True)
@@ -69,12 +69,12 @@ class FigureOptions:
     resolution: int = 512  # Width of a panel in pixels
     spp: int = 256  # Samples per pixel
     width: float = PAGE  # Width on paper in millimetres
-    formats: tuple[str, ...] = ("png", "pdf", "exr", "csv")  # Written if the figure has them
+    formats: tuple[str, ...] = ("png", "pdf", "exr", "csv")  # Formats to write, if the figure has them
     scheme: str = "catmull_clark"
-    cage: Path | None = None  # File of a Catmull-Clark cage to show in place of the figure's own
+    cage: Path | None = None  # File of a Catmull-Clark cage in place of the figure's own
 
     def command(self, name: str, variant: str | None) -> str:
-        """The command line that draws a figure again, with the variant and samples if it is rendered."""
+        """The command line of a figure, with the variant and samples if it is rendered."""
         values: dict[str, object] = {"width": f"{self.width:g}mm", "resolution": self.resolution, "cage": self.cage}
         values |= {"scheme": self.scheme} if self.scheme != type(self).scheme else {}
         values |= {"spp": self.spp, "variant": variant} if variant else {}
@@ -84,10 +84,10 @@ class FigureOptions:
 
 def panels(options: FigureOptions, rows: int, columns: int, **more: Any) -> tuple[Figure, Any]:
     """Make axes by `matplotlib.pyplot.subplots` over the width of the figure; `write_figure` sets its height."""
-    import matplotlib  # Not above, as the command line imports this module for every command
+    import matplotlib  # Local, as every command imports this module
 
     matplotlib.use("Agg")
-    # Fixed dates and identifiers in files, so that the same command twice gives the same file.
+    # Fixed dates and identifiers, so that a command always writes the same file.
     os.environ.setdefault("SOURCE_DATE_EPOCH", "0")
     matplotlib.rcParams.update({**STYLE, "font.size": TEXT_SIZES[options.width >= BETWEEN]})
     from matplotlib import pyplot
@@ -107,16 +107,16 @@ def write_figure(
     options: FigureOptions,
     name: str,
     figure: Figure,
-    rendered: Sequence[NDArray[np.floating]] = (),  # Linear pixels of pictures of one height, whose R, G and B are kept
+    rendered: Sequence[NDArray[np.floating]] = (),  # Linear pixels of pictures of one height; R, G and B are written
     *,
-    cage: str,  # What the figure shows without a cage of the user
+    cage: str,  # Name of the figure's own cage
     per_row: int | None = None,  # Pictures side by side; by default, all
     pixels: int | None = None,  # Width of the first axes; by default, that of the options
-    layouts: int = LAYOUTS,  # How often the height of the figure is set to that of its contents
-    numbers: Sequence[Sequence[object]] = (),  # Rows of a table, names of columns first
+    layouts: int = LAYOUTS,  # Number of times that the height of the figure is fitted to its contents
+    numbers: Sequence[Sequence[object]] = (),  # Rows of a table, first the names of columns
     **metadata: Any,  # Further metadata of the OpenEXR file
 ) -> list[Path]:
-    """Write a figure as PNG and PDF, its pictures as OpenEXR and its numbers as CSV, where wanted, and close it.
+    """Write a figure as PNG and PDF, its pictures as OpenEXR and its numbers as CSV, if requested, and close it.
 
     Pictures keep their pixels in PDF. Images have the version, the command and the cage as metadata.
     """
@@ -124,9 +124,9 @@ def write_figure(
     from matplotlib.image import AxesImage
     from matplotlib.pyplot import close, setp
 
-    # Pictures are resampled whenever they are drawn, which a layout does not need.
+    # Layouts need no pictures, which are resampled whenever they are drawn.
     setp(images := figure.findobj(AxesImage), visible=False)
-    # Panels of a fixed aspect leave room above and below them. A half of that to a legend is left each time.
+    # Panels of a fixed aspect leave room above and below. Half of the room up to a legend is left each time.
     for _ in range(layouts):
         figure.draw_without_rendering()
         figure.set_size_inches(figure.get_figwidth(), figure.get_tightbbox().height + 2 * PAD)
@@ -183,6 +183,6 @@ def label_powers(axis: Axis) -> None:
 
 
 def hide_frame(axis: Axes) -> None:
-    """Draw no frame and no ticks around a panel of equal units; unlike `set_axis_off`, this keeps its labels."""
+    """Hide frame and ticks of a panel of equal units; unlike `set_axis_off`, this keeps its labels."""
     axis.set(xticks=[], yticks=[], aspect="equal")
     axis.spines[:].set_visible(False)

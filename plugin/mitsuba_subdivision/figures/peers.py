@@ -1,7 +1,7 @@
-"""Surfaces of OpenSubdiv and Blender, computed by their own programs, for the figures that compare with them.
+"""Surfaces of OpenSubdiv and Blender, computed by programs, for figures that compare with them.
 
-``python tests/peers/peers.py`` compiles the program for OpenSubdiv, `osd_peer`. Where a program is not found, figures
-leave out its surface, and say so.
+``python tests/peers/peers.py`` compiles the program for OpenSubdiv, `osd_peer`. If a program is not found, figures omit
+its surface with a message.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from ..cage import ControlCage
 from ..messages import print_remark
 from .output import FigureError
 
-# Before each array: its name, its type, and the number of its values.
+# Header of an array: name, type and number of values.
 _HEADER = np.dtype([("name", "S16"), ("type", "S8"), ("size", "<i8")])
-# Environment variable with the folder of the programs, where that is not on the path.
+# Environment variable for the folder of programs that are not on the path.
 VARIABLE = "MITSUBA_SUBDIVISION_PEERS"
 BLENDER_SCRIPT = Path(__file__).with_name("blender_script.py")
 
 
 def osd_peer() -> Path | None:
-    """The program `osd_peer`: in the folder that `VARIABLE` names, on the path, or as the tests compiled it last."""
+    """The program `osd_peer`: in the folder of `VARIABLE`, on the path, or last compiled by the tests."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "mitsuba-subdivision" / "peers"
     return _program("osd_peer", str(cache))
 
 
 def blender() -> Path | None:
-    """The program `blender`: in the folder that `VARIABLE` names, or on the path."""
+    """The program `blender`: in the folder of `VARIABLE`, or on the path."""
     return _program("blender")
 
 
@@ -50,11 +50,11 @@ def _program(name: str, *more: str) -> Path | None:
 def osd_samples(
     program: Path, cage: ControlCage, element: ArrayLike, uv: ArrayLike, method: str, level: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Points and unit normals ``(s, 3)`` of OpenSubdiv's Catmull-Clark surface in float32, its usual precision.
+    """Points and unit normals ``(s, 3)`` of OpenSubdiv's Catmull-Clark surface in float32, its default precision.
 
     The cage has quads without tags; elements broadcast with parameters ``(s, 2)``. The method is "far", patch tables
-    that isolate extraordinary vertices at a level up to 10, or "bfr", surfaces of single faces that are approximated
-    at a level. Normals are not a number where derivatives are parallel or vanish.
+    with isolation levels up to 10, or "bfr", surfaces of single faces with an approximation level. Normals are not a
+    number where derivatives are parallel or zero.
     """
     element, u, v = np.broadcast_arrays(element, np.asarray(uv)[..., 0], np.asarray(uv)[..., 1])
     integers = {"widths": [3, 0], "sizes": cage.face_sizes, "corners": cage.face_vertices, "face": element}
@@ -73,8 +73,8 @@ def osd_samples(
 
 
 def blender_mesh(program: Path, cage: ControlCage, level: int) -> tuple[NDArray, NDArray, NDArray, str]:
-    """Points and shading normals ``(n, 3)`` of Blender's modifier at a level, faces ``(m, 4)``, Blender's version."""
-    # Several threads race for the last bits of points that faces share.
+    """Points and shading normals ``(n, 3)``, faces ``(m, 4)`` of Blender's modifier at a level; Blender's version."""
+    # Several threads make the last bits of shared points random.
     options = ["--threads", "1", "--background", "--factory-startup", "--python-exit-code", "1"]
     options += ["--python", str(BLENDER_SCRIPT), "--"]
     arrays = {"positions": cage.positions, "sizes": cage.face_sizes, "corners": cage.face_vertices}
@@ -86,7 +86,7 @@ def blender_mesh(program: Path, cage: ControlCage, level: int) -> tuple[NDArray,
 
 
 def _answer(program: Path, before: list[str], query: bytes, after: list[str]) -> bytes:
-    """Run a program on the contents of a file, with words before and after the names of the two files."""
+    """Run a program with an input file of these contents and an output file; return the output."""
     with tempfile.TemporaryDirectory() as folder:
         queries, answers = Path(folder, "queries"), Path(folder, "answers")
         queries.write_bytes(query)
@@ -98,7 +98,7 @@ def _answer(program: Path, before: list[str], query: bytes, after: list[str]) ->
 
 
 def as_bytes(records: Mapping[str, NDArray]) -> bytes:
-    """Arrays of int32 and float64, as the peers' programs read them (``peer_common.h``)."""
+    """Arrays of int32 and float64 in the format of the peers' programs (``peer_common.h``)."""
     data = b""
     for name, values in records.items():
         kind = "i" if values.dtype == np.int32 else "d"
@@ -107,7 +107,7 @@ def as_bytes(records: Mapping[str, NDArray]) -> bytes:
 
 
 def from_bytes(data: bytes) -> dict[str, NDArray]:
-    """Arrays that `as_bytes` or a peer's program wrote."""
+    """Arrays in the format of `as_bytes`."""
     records: dict[str, NDArray] = {}
     while data:
         (name, kind, count), rest = np.frombuffer(data, _HEADER, 1)[0], data[_HEADER.itemsize :]

@@ -1,4 +1,4 @@
-"""Figures that are renders of one scene each: a human figure, schemes, shading, and a jar that is displaced."""
+"""Figures that render one scene each: a human figure, schemes, shading, and a displaced jar."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def draw_schemes(options: FigureOptions) -> list[Path]:
 
 
 def draw_shading(options: FigureOptions) -> list[Path]:
-    """Render brushed metal with normals of vertices, and with those of the surface at every hit."""
+    """Render brushed metal with vertex normals, and with exact shading."""
     titles = (f"{SHADING_TITLES[kind]}\n{rate} segments per edge" for kind, rate in SHADINGS)
     cases = ({"shading": kind, "rate": rate} for kind, rate in SHADINGS)
     return _draw_row(options, "shading", "rook.obj", dict(zip(titles, cases, strict=True)))
 
 
 def _draw_row(options: FigureOptions, name: str, cage: str, cases: Mapping[str, Mapping[str, Any]]) -> list[Path]:
-    """Render the scene of a figure with parameters for each panel, given by titles as in `render_panels`."""
+    """Render the scene of a figure with parameters for each panel, by titles as in `render_panels`."""
     figure, axes = panels(options, 1, len(cases))
     scenes = ((title, load_stage(name, **case, resolution=options.resolution)) for title, case in cases.items())
     rendered = render_panels(options, axes, scenes)
@@ -54,22 +54,22 @@ def _draw_row(options: FigureOptions, name: str, cage: str, cases: Mapping[str, 
     return write_figure(options, name, figure, rendered, cage=cage, **metadata)
 
 
-# Pixels from triangles of the jar to the surface at most; more in the slice where triangles are drawn.
+# Pixel error of the jar's triangles; larger in the slice where triangles are drawn.
 PIXEL_ERROR, PIXEL_ERROR_OF_LINES, SCALE = 0.08, 1.5, 0.115
-ENDS = (0.0, 0.35, 0.64, 1.0)  # Where slices end, as parts of the width
+ENDS = (0.0, 0.35, 0.64, 1.0)  # Ends of slices, relative to the width
 COLUMNS, ROWS = 1536, 1536  # Pixels of the image of heights, around the jar and along its profile
-# Grooves of a kind around the jar, and cushions from one part of its profile up to another.
+# Number of grooves of a kind around the jar, and of cushions between two heights of its profile.
 AROUND, UP, LOWEST, HIGHEST = 12, 10, 0.10, 0.70
-# Radius of beads, and height over which cushions grow, in cushions; how round grooves are. Slopes of a bitmap jump at
-# its texels, which shows as dashes along grooves that are two texels wide: these are eight wide.
+# Radius of beads, and height over which cushions grow, relative to cushions; roundness of grooves. Slopes of a bitmap
+# jump at its texels, which is visible along grooves that are two texels wide: these are eight wide.
 BEAD, FADE, SOFT = 0.21, 0.5, 0.1
 GLAZE, LINES = (0.009, 0.105, 0.10), (0.42, 0.58, 0.52)
-# Width of lines, as a part of triangles' heights, and side of the image that they are drawn in.
+# Width of lines relative to triangles' heights, and side of their image.
 LINE, LINE_IMAGE = 0.045, 256
 
 
 def draw_displacement(options: FigureOptions) -> list[Path]:
-    """Render a jar before it is displaced, displaced, and its triangles: three slices of one picture."""
+    """Render a jar without displacement, with it, and its triangles, as three slices of one picture."""
     width, height = picture_size(options)
     sensor = load_stage("displacement", width=width, height=height, columns=width).sensors()[0]
     plain = {
@@ -93,10 +93,10 @@ def draw_displacement(options: FigureOptions) -> list[Path]:
 
 
 def quilt() -> NDArray[np.float32]:
-    """Heights, up to 1, of cushions between grooves with a bead at each crossing: an image that repeats sideways."""
+    """Image of heights up to 1 that repeats sideways: cushions between grooves, with a bead at each crossing."""
     x, y = np.meshgrid((np.arange(COLUMNS) + 0.5) / COLUMNS, (np.arange(ROWS) + 0.5) / ROWS)
     part = (y - LOWEST) / (HIGHEST - LOWEST)
-    # Grooves lie where either of these is an integer.
+    # Grooves lie where one of these is an integer.
     p, q = x * AROUND + part * UP / 2, x * AROUND - part * UP / 2
     cushion = np.sqrt((np.sin(np.pi * p) * np.sin(np.pi * q)) ** 2 + SOFT**2) - SOFT
     away = np.hypot((p + 0.5) % 1 - 0.5, (q + 0.5) % 1 - 0.5) / BEAD

@@ -1,4 +1,4 @@
-"""Staging: cages of users in place of a figure's own, surfaces and meshes in scenes, renders, and points in these."""
+"""Cages of users in place of a figure's own, surfaces and meshes in scenes, renders, and projections of points."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ from ..surface import LimitSurface
 from ..variants import SceneNode
 from .output import FigureError, FigureOptions, panels, show, write_figure
 
-# Samples of one part: they decide how much memory a render takes, and how often its progress is shown.
+# Samples of one part, which determine a render's memory and its steps of progress.
 PART_SAMPLES = 1 << 26
-# A picture that stands alone is wider than panels of a figure, by this factor, and 8 : 5.
+# A single picture is wider than panels of a figure by this factor, with an aspect of 8 : 5.
 WIDER, HEIGHT = 2.25, 0.625
-# Points are lifted off their surface by this part of their distance to the camera, before they are tested.
+# Offset of points from their surface for visibility tests, relative to the camera's distance.
 LIFT = 2e-3
-REFINEMENTS = 2  # Isolate every extraordinary vertex
-# Faces whose control points are farther from the vertex than this are holes, in lengths of the shortest edge there.
+REFINEMENTS = 2  # Enough to isolate every extraordinary vertex
+# Distance from the vertex beyond which faces are holes, relative to the shortest edge there.
 FAR = 4
-# Sizes of a cage that stands before a camera, the largest first, and what stays free at each side of the picture.
+# Sizes of a cage before a camera, the largest first, and margin at each side of the picture.
 SCALES, MARGIN = np.geomspace(4, 0.4, 100), 0.04
-SMALLEST = 1e-300  # Size of a cage in one point
+SMALLEST = 1e-300  # Size of a cage of equal points
 
 
 def load_stage(name: str, **parameters: str | float) -> mi.Scene:
     """Load a scene of the figures, with values for some of its parameters."""
-    # With other filters than the box, the order of sums, and so the last bits, vary from run to run.
+    # With other filters than the box, the order of sums, and so the last bits, vary.
     return load_scene(example_file(f"{name}.xml"), parameters, "box").scene
 
 
 def make_mesh(
     positions: NDArray[np.floating], triangles: NDArray[np.integer], bsdf: SceneNode, **buffers: NDArray[np.floating]
 ) -> mi.Mesh:
-    """Make a mesh with buffers of `mitsuba_mesh`; without `vertex_normals`, it gets averages of the triangles' own."""
+    """Make a mesh with buffers of `mitsuba_mesh`; by default, vertex normals are averages of the triangles'."""
     averages = "vertex_normals" not in buffers
     buffers["vertex_positions"] = positions
     return mitsuba_mesh("figure", triangles, buffers, bsdf=mi.load_dict(bsdf), averages_normals=averages)
@@ -58,7 +58,7 @@ def limit_surface(cage: ControlCage, rate: int, bsdf: SceneNode | mi.BSDF, **par
 
 
 def staged(stage: mi.Scene, shapes: Sequence[mi.Shape] | None = None, **objects: Any) -> mi.Scene:
-    """Make a scene with the camera, integrator, emitters and all or some shapes of another, and with more objects."""
+    """Make a scene with the camera, integrator, emitters and some or all shapes of another, and more objects."""
     children = {f"shape{i}": shape for i, shape in enumerate(stage.shapes() if shapes is None else shapes)}
     apart = [emitter for emitter in stage.emitters() if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
     children |= {f"emitter{i}": emitter for i, emitter in enumerate(apart)}
@@ -73,7 +73,7 @@ def render(scene: mi.Scene, options: FigureOptions, name: str) -> NDArray[np.flo
 
 
 def _parts(spp: int, most: int) -> list[int]:
-    """Split samples per pixel into powers of 4: stratified samplers can spread such numbers evenly over a pixel."""
+    """Split samples per pixel into powers of 4, which stratified samplers can spread evenly over a pixel."""
     parts: list[int] = []
     while rest := spp - sum(parts):
         parts.append(4 ** ((max(min(rest, most), 1).bit_length() - 1) // 2))
@@ -81,7 +81,7 @@ def _parts(spp: int, most: int) -> list[int]:
 
 
 def picture_size(options: FigureOptions) -> tuple[int, int]:
-    """Width and height in pixels of a picture that stands alone."""
+    """Width and height in pixels of a single picture."""
     width = round(WIDER * options.resolution)
     return width, round(HEIGHT * width)
 
@@ -100,7 +100,7 @@ def draw_picture(
 
 
 def on_white(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Put linear RGBA pixels, premultiplied by alpha as Mitsuba makes them, on white: 8-bit sRGB."""
+    """Composite linear RGBA pixels, premultiplied by alpha, on white: 8-bit sRGB."""
     return in_8_bits(pixels[..., :3] + (1 - np.clip(pixels[..., 3:], 0, 1)))
 
 
@@ -120,7 +120,7 @@ def edge_rods(
 ) -> SceneNode:
     """Rods along edges of a cage, given by their ends ``(n, 2)``, with joints there; by colours in sRGB and radii."""
     shapes: SceneNode = {}
-    # The sharpest edge comes last: a vertex keeps the joint of that edge.
+    # The sharpest edge comes last, so that a vertex keeps its joint.
     for edge in np.argsort(sharpness, kind="stable"):
         colour, radius = looks[edge]
         rod = {"radius": radius, "bsdf": paint(colour)}
@@ -149,7 +149,7 @@ def grid_triangles(segments: int, count: int) -> NDArray[np.integer]:
 
 
 def render_panels(options: FigureOptions, axes: Any, scenes: Iterable[tuple[str, Any]]) -> list[NDArray[np.float32]]:
-    """Render a scene in each panel, by titles whose second line stands below the panel; returns the pictures."""
+    """Render a scene in each panel, by titles whose second line is the caption; returns the pictures."""
     rendered = []
     for (title, scene), axis in zip(scenes, axes.flat, strict=True):
         name, _, caption = title.partition("\n")
@@ -162,7 +162,7 @@ def project(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.float
     """Pixel coordinates ``(.., 2)`` of world points ``(.., 3)``."""
     parameters = mi.traverse(sensor)
     camera = _in_camera(sensor, points)
-    # Mitsuba's cameras look along +z, with x to the left and y up. An orthographic camera sees x and y from -1 to 1.
+    # Mitsuba's cameras look along +z, with x to the left and y up. An orthographic camera covers -1 to 1 in x and y.
     half_width = np.ones_like(camera[..., 2:])
     if "x_fov" in parameters:
         half_width = camera[..., 2:] * np.tan(np.radians(float(np.array(parameters["x_fov"]).item()) / 2))
@@ -171,7 +171,7 @@ def project(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.float
 
 
 def visible(scene: mi.Scene, points: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Whether no part of the scene lies between each point ``(n, 3)`` and its orthographic camera."""
+    """Whether each point ``(n, 3)`` is visible to the scene's orthographic camera."""
     sensor = scene.sensors()[0]
     backward = -camera_matrix(sensor)[:3, 2]
     start = points + LIFT * _in_camera(sensor, points)[:, 2:] * backward
@@ -182,7 +182,7 @@ def visible(scene: mi.Scene, points: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 def visible_runs(scene: mi.Scene, lines: NDArray[np.floating]) -> list[NDArray[np.float64]]:
-    """Parts of polylines ``(m, points, 3)`` that the camera sees, in pixels, each ``(.., 2)``."""
+    """Visible parts of polylines ``(m, points, 3)`` in pixels, each ``(.., 2)``."""
     seen = visible(scene, lines.reshape(-1, 3)).reshape(lines.shape[:2])
     positions = project(scene.sensors()[0], lines)
     parts = [np.ma.flatnotmasked_contiguous(np.ma.array(shown, mask=~shown)) for shown in seen]
@@ -200,10 +200,10 @@ def _in_camera(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.fl
 
 
 def around_vertices(path: Path, most: int) -> dict[str, ControlCage]:
-    """A Catmull-Clark cage, renumbered from its extraordinary vertices of lowest valences, by their names.
+    """A Catmull-Clark cage, renumbered for each of its extraordinary vertices of lowest valences, by their names.
 
-    That vertex is vertex 0, the first faces lie around it, and each of them begins with it. Centres of faces are
-    vertices of the refined cage; they count only if there are no others.
+    The vertex is vertex 0, and the first faces lie around it and begin with it. Centres of faces, which are vertices of
+    the refined cage, count only if there are no others.
     """
     cage, name = read(path), "valence"
     count = cage.vertex_count
@@ -219,7 +219,7 @@ def around_vertices(path: Path, most: int) -> dict[str, ControlCage]:
 
 
 def motion(old: tuple[NDArray[np.float64], ...], new: tuple[NDArray[np.float64], ...]) -> NDArray[np.float64]:
-    """The map ``(4, 4)`` that moves, turns and scales one frame to another, as `frame` returns them."""
+    """The similarity ``(4, 4)`` from one frame of `frame` to another."""
     matrix = np.eye(4)
     matrix[:3, :3] = new[1] @ old[1].T * (new[2] / old[2])
     matrix[:3, 3] = new[0] - matrix[:3, :3] @ old[0]
@@ -254,7 +254,7 @@ def frame(surface: LimitSurface, face: int = 0, corner: int = 0) -> tuple[NDArra
 
 
 def in_view(cage: ControlCage, sensor: mi.Sensor) -> ControlCage:
-    """The cage, standing on the ground below the origin, as large as the camera sees it whole."""
+    """The cage, standing on the ground below the origin, as large as the picture allows."""
     least, most = cage.positions.min(axis=0), cage.positions.max(axis=0)
     standing = cage.positions - least - np.array([0.5, 0.5, 0]) * (most - least)
     standing /= max(np.linalg.norm(standing, axis=1).max(), SMALLEST)
@@ -270,7 +270,7 @@ def in_ball(cage: ControlCage, radius: float) -> ControlCage:
 
 
 def _isolated_fans(cage: ControlCage, end: int) -> dict[int, NDArray[np.integer]]:
-    """Half-edges around an extraordinary vertex before ``end``, of each valence, whose faces are regular otherwise."""
+    """For each valence, half-edges around an extraordinary vertex before ``end`` whose faces have no other."""
     topology, contents = cage.topology, cage.contents
     if (cage.face_sizes != 4).any():
         return {}
@@ -288,7 +288,7 @@ def _isolated_fans(cage: ControlCage, end: int) -> dict[int, NDArray[np.integer]
 
 
 def _numbered(cage: ControlCage, fan: NDArray[np.integer]) -> ControlCage:
-    """The same cage with faces and vertices numbered so that the fan's come first; faces far away become holes."""
+    """The same cage, with the fan's faces and vertices first; distant faces become holes."""
     contents, faces = cage.contents, cage.face_vertices.reshape(-1, 4)
     vertex, first = cage.face_vertices[fan[0]], fan // 4
     order = np.concatenate([first, np.setdiff1d(np.arange(len(faces)), first)])

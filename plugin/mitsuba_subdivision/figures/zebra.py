@@ -20,11 +20,11 @@ from . import staging
 from .output import FigureOptions, hide_frame, panels, show, write_figure
 from .peers import blender, blender_mesh, osd_peer, osd_samples
 
-LEVEL = 3  # Level of the refined mesh, as programs without limit surfaces render it
-# Level of all other surfaces, so that they differ only in points and normals at the vertices; of a user's cage, whose
-# faces around a vertex are as many as a hundred, the second one.
+LEVEL = 3  # Level of the refined mesh, typical of programs without limit surfaces
+# Level of all other surfaces, which then differ only in points and normals at the vertices; the second for a user's
+# cage, which has up to a hundred faces.
 FINE_LEVEL, OWN_LEVEL = 7, 5
-# Dark and light bands from pole to pole of the environment, and the angle of their axis to the x axis of the image.
+# Dark and light bands from pole to pole of the environment, and angle between their axis and the image's x axis.
 STRIPES = 84
 AXIS_ANGLE = 38
 STRIPE_PIXELS = 4096
@@ -32,7 +32,7 @@ DARK, LIGHT = 0.015, 0.92
 # Fields of view of the close-up, and of the overview of the whole surface.
 FIELD_OF_VIEW, WIDE_FIELD_OF_VIEW = 5.2, 16.5
 WIDE_STRIPES = 28
-# Face of `cube`, and the corner of that face, that the close-up shows.
+# Face of `cube`, and its corner, in the close-up.
 CORNER_FACE, CORNER = 1, 2
 NORMAL_RAYS = 5
 # OpenSubdiv's own default for surfaces of single faces (Bfr).
@@ -44,7 +44,7 @@ RING = "#0a84c6"
 
 
 def draw_zebra(options: FigureOptions) -> list[Path]:
-    """Render mirrors amid stripes with the normals of several methods, and their angles to the exact ones below."""
+    """Render mirrors amid stripes with normals by several methods, and below their angles to the exact normals."""
     stage = staging.load_stage("zebra", resolution=options.resolution, fov=FIELD_OF_VIEW)
     surface, level, at = LimitSurface(cube()), FINE_LEVEL, (CORNER_FACE, CORNER)
     if options.cage:
@@ -54,21 +54,21 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
         surface, level, at = LimitSurface(cage), OWN_LEVEL, (0, 0)
     shapes, titles = _shapes(surface.cage, level)
     stripes = _stripes(stage.sensors()[0], STRIPES)
-    # Shading normals where a few rays of each pixel hit, (rays, height, width, 3).
+    # Shading normals at the hits of a few rays per pixel, (rays, height, width, 3).
     aov, pixels, normals = mi.load_dict({"type": "aov", "aovs": "normal:sh_normal"}), {}, {}
     for name, shape in shapes.items():
         scene = staging.staged(stage, shape=shape, stripes=stripes)
         pixels[name] = staging.render(scene, options, f"reflection lines: {name}")
         rays = [render_pixels(scene, seed, 1, integrator=aov)[..., -3:] for seed in range(NORMAL_RAYS)]
         normals[name] = np.array(rays, dtype=np.float64)
-    # All surfaces get the same rays. The median leaves out a ray that slips between two triangles.
+    # All surfaces get the same rays. The median ignores a ray that passes between two triangles.
     exact = normals.pop("exact")
     angles = {name: np.median(np.nan_to_num(normal_angle(exact, n)), axis=0) for name, n in normals.items()}
     tip = surface.evaluate(at[0], np.zeros((1, 2)), at[1]).p
 
     figure, axes = panels(options, 2, len(shapes))
     for axis, (name, drawn) in zip(axes[0], pixels.items(), strict=True):
-        # Coloured where bands differ from those of the exact surface.
+        # Colour bands that differ from the exact surface's.
         wrong = np.clip(np.abs(drawn - pixels["exact"])[..., :3].mean(axis=-1, keepdims=True) / (LIGHT - DARK), 0, 1)
         marked = (1 - wrong) * staging.on_white(drawn) + wrong * WRONG
         (title, caption), share = titles[name], f"{100 * wrong.mean():.1f} % wrong"
@@ -90,7 +90,7 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
 
 
 def _shapes(cage: ControlCage, level: int) -> tuple[dict[str, Any], dict[str, tuple[str, str]]]:
-    """Mirrors by name, the exact one first; and their titles: who made the surface, and how."""
+    """Mirrors by name, the exact one first, and titles with program and method."""
     exact, refined = staging.limit_surface(cage, 2**level, MIRROR), cage
     for _ in range(LEVEL):
         refined = refined.refined()

@@ -1,4 +1,4 @@
-"""Readers and writers of files: OBJ, PLY and USD. Public names are parts of the reader of USD meshes."""
+"""Readers and writers of OBJ, PLY and USD files. Public names are parts of the reader of USD meshes."""
 
 from .usd_reader import MeshReader, reversed_order
 from .usd_skinning import Skinning

@@ -1,6 +1,6 @@
-"""The table of file formats, and reading and writing of control cages and of triangles by the suffix of the file.
+"""The table of file formats; readers and writers of control cages and triangles by the suffix of the file.
 
-A new format is one module with its functions, and one line in `FORMATS`.
+A new format is a module and a line in `FORMATS`.
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from ..mesh.connectivity import IntArray
 
 @dataclass(frozen=True)
 class Format:
-    """Functions that read and write files of one format, and how its files differ from others.
+    """Readers and writers of a file format, and its properties.
 
-    Functions are named "module:function", with a module of this package that is imported when it is first used.
+    Functions are named "module:function"; the module of this package is imported on first use.
     """
 
-    # From a path to `CageContents`. If the format has prims, it also takes `prim`, `time` and the rules that replace
-    # the file's own, as `ControlCage.from_file` does.
+    # Reads `CageContents` from a path. If the format has prims, it also takes `prim`, `time` and the rules that replace
+    # the file's own, as in `ControlCage.from_file`.
     read: str
     write: str = ""  # Takes `CageContents` and a path; empty if there is none
     write_triangles: str = ""  # Takes a path and `Triangles`; empty if there is none
     _: KW_ONLY
-    has_prims: bool = False  # Whether a file may hold several meshes, and values at several times
+    has_prims: bool = False  # Whether a file may contain several meshes, and values at several times
     refers_to_files: bool = False  # Whether other files may change the contents of a file
-    up: str | None = "y"  # Upward axis, "y" or "z", of modelling programs' files by default; None if files store it
+    up: str | None = "y"  # Usual up axis of modelling programs' files, "y" or "z"; None if files store it
 
 
 _USDZ = Format("usd_reader:read_usd", has_prims=True, refers_to_files=True, up=None)
 _USD = replace(_USDZ, write="usd_writer:write_usd", write_triangles="usd_writer:write_usd_triangles")
-# Formats by suffix. OBJ files of Blender, Maya and Houdini have y up, PLY files of Blender z. An archive, ".usdz", can
-# be read but not written.
+# Formats by suffix. Blender, Maya and Houdini write OBJ files with y up, Blender PLY files with z up. Archives
+# (".usdz") can only be read.
 FORMATS = {
     ".obj": Format("obj:read_obj", "obj:write_obj", "obj:write_obj_triangles"),
     ".ply": Format("ply:read_ply", "ply:write_ply", "ply:write_ply_triangles", up="z"),
@@ -52,7 +52,7 @@ FORMATS = {
 
 
 class Triangles(NamedTuple):
-    """Triangles on a limit surface, and the data at their vertices."""
+    """Triangles on a limit surface, and data at their vertices."""
 
     positions: NDArray  # (n, 3) float32 or float64
     normals: NDArray  # The same
@@ -64,7 +64,7 @@ class Triangles(NamedTuple):
 def read_file(path: str | Path, prim: str | None, time: float | None, rules: Mapping[str, str]) -> CageContents:
     """Read a file of any known format; the parameters are those of `ControlCage.from_file`."""
     known = FORMATS[_known_suffix(path, FORMATS)]
-    # What else keeps a file from being opened is an OSError of the reader.
+    # For other problems, the reader raises OSError.
     if os.path.isdir(path):
         raise CageError(f'"{path}" is a folder; expected a file')
     try:
@@ -89,7 +89,7 @@ def write_file(contents: CageContents, path: str | Path) -> None:
 
 
 def is_usd(path: Path) -> bool:
-    """Whether a file may hold several meshes, and values at several times."""
+    """Whether a file may contain several meshes, and values at several times."""
     known = FORMATS.get(path.suffix.lower())
     return known is not None and known.has_prims
 
@@ -131,7 +131,7 @@ def material_of_face(contents: CageContents) -> IntArray:
 
 
 def warn_of_losses(path: str | Path, parts: Mapping[str, bool]) -> None:
-    """Warn of the parts of a cage, by their names, that are lost in a file of this format."""
+    """Warn of parts of a cage, by name, that files of this format cannot store."""
     if lost := [name for name, is_lost in parts.items() if is_lost]:
         suffix = os.path.splitext(path)[1]
         warn(f'"{path}": {suffix} files have no place for {", ".join(lost)} of the cage; written without them')

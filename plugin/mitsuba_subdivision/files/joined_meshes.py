@@ -21,8 +21,8 @@ _PARTS = {"vertices": "positions", "faces": "face_sizes", "creases": "creases", 
 def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
     """Join meshes with valid indices to one cage; messages begin with the name of their file.
 
-    Texture coordinates and attributes are kept if all meshes have them, with the same interpolation and width, else
-    there is a warning. Meshes of different rules or schemes are an error.
+    Texture coordinates and attributes that not all meshes have, with the same interpolation and width, are dropped with
+    a warning. Meshes of different rules or schemes are an error.
     """
     if len(meshes) == 1:
         return meshes[0]
@@ -33,7 +33,7 @@ def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
     starts = {
         part: ragged.starts(np.array([len(getattr(mesh, rows)) for mesh in meshes])) for part, rows in _PARTS.items()
     }
-    # Each mesh with the number of its first vertex, and of its first face.
+    # Each mesh with the numbers of its first vertex and face.
     by_vertex = list(zip(meshes, starts["vertices"].tolist(), strict=True))
     by_face = list(zip(meshes, starts["faces"].tolist(), strict=True))
     texcoords, attributes = _joined_data(meshes, name)
@@ -75,7 +75,7 @@ def _joined_data(meshes: Sequence[CageContents], name: str) -> tuple[Attribute |
 
 
 def _joined_attribute(given: Sequence[Attribute | None]) -> Attribute | None:
-    """The attribute of all meshes; None if one does not have it, or with another interpolation or width."""
+    """The attribute of all meshes; None if one lacks it, or has another interpolation or width."""
     parts = [part for part in given if part is not None]
     if len(parts) < len(given) or len({(part.interpolation, part.values.shape[1]) for part in parts}) > 1:
         return None
@@ -89,10 +89,10 @@ def _joined_attribute(given: Sequence[Attribute | None]) -> Attribute | None:
 
 @dataclass(frozen=True, eq=False)
 class _JoinedSource(CageSource):
-    """Source of a cage that was joined from several meshes: names the mesh, and the number in this mesh."""
+    """Source of a cage that was joined from several meshes: names the mesh and the index in this mesh."""
 
     meshes: Sequence[CageSource] = ()
-    # By the names of `_PARTS`, (len(meshes),) int: number of the first part of each mesh in the cage
+    # By the names of `_PARTS`, (len(meshes),) int: index in the cage of each mesh's first part
     starts: Mapping[str, IntArray] = field(default_factory=dict)
 
     def at_face(self, face: int) -> str:

@@ -1,7 +1,7 @@
 """Reader of Wavefront OBJ control cages, by whole-array operations on the bytes of the file, and writers.
 
-Tags are those of OpenSubdiv's regression shapes. A statement ``t name i/f/s ..`` gives the tag's name, the numbers of
-its integers, floats and strings, and then these. Vertices and faces count from 0, unlike those of ``f`` statements.
+Tags are those of OpenSubdiv's regression shapes: ``t name i/f/s ..`` has the tag's name, the numbers of its integers,
+floats and strings, and these values. Vertices and faces count from 0, unlike in ``f`` statements.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from ..mesh.connectivity import IntArray
 from ..whole_file import whole_file
 from .formats import Triangles, faces_by_name, material_of_face, warn_of_losses
 
-ROWS = 1 << 16  # Turned into text at once: bounds the memory for numbers as Python objects
+ROWS = 1 << 16  # Rows of a block of text, which bounds the memory for numbers as Python objects
 _SPACE, _NEWLINE = b" \n"
 _COMMENT = re.compile(rb"#[^\n]*")
-# The name of a material may have a "#" in it, but for one between spaces.
+# The name of a material may contain a "#", but not between spaces.
 _MATERIAL, _COMMENT_OF_NAME = re.compile(rb"[ \t]*usemtl[ \t]"), re.compile(rb"[ \t]#(?=\s|$)")
-# Files that are often named ".obj" but are something else, by their first bytes.
+# Other formats of files that are often named ".obj", by their first bytes.
 _NO_TEXT = {
     b"\xff\xfe": "text in UTF-16; expected ASCII or UTF-8",
     b"\xfe\xff": "text in UTF-16; expected ASCII or UTF-8",
@@ -37,10 +37,10 @@ _NO_TEXT = {
     b"BZh": "compressed with bzip2; expected the text, which bunzip2 makes of it",
 }
 _SLASH = ord("/")
-# Patterns for messages; compiled when there is an error.
+# Patterns for messages, compiled at an error.
 _NUMBER = rb"(?i)[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf|infinity)"
 _CORNER = rb"[+-]?\d+(/[+-]?\d+|/([+-]?\d+)?/[+-]?\d+)?"
-# Tags that choose a rule: the rule, and its values by the tag's integer or string.
+# Tags of a rule: the rule, and its values by the tag's integer or string.
 RULE_TAGS: dict[str, tuple[str, dict[Any, str]]] = {
     "interpolateboundary": ("boundary", {0: "none", 1: "edge_and_corner", 2: "edge_only"}),
     "facevaryinginterpolateboundary": (
@@ -50,22 +50,23 @@ RULE_TAGS: dict[str, tuple[str, dict[Any, str]]] = {
     "creasemethod": ("crease_method", {"normal": "uniform", "chaikin": "chaikin"}),
     "smoothtriangles": ("triangle_rule", {"catmark": "catmull_clark", "smooth": "smooth"}),
 }
-# Tags that list edges, vertices or faces: integers and floats of each one, and what they are in messages.
+# Tags of edges, vertices or faces: numbers of integers and floats of each, and names for messages.
 _LIST_TAGS = {
     "crease": (2, 1, "two integers per edge and a float for all or for each"),
     "corner": (1, 1, "one integer per vertex and a float for all or for each"),
     "hole": (1, 0, "one or more integers and no floats"),
 }
 _HEAD = re.compile(r"\s*(\S+)\s+(\d+)/(\d+)/(\d+)(?!\S)")
-# Older versions of OpenSubdiv had this tag for the difference between "corners_plus1" and "corners_plus2".
+# In older versions of OpenSubdiv, this tag distinguished "corners_plus1" and "corners_plus2".
 _PROPAGATE = "facevaryingpropagatecorners"
 
 
 def read_obj(path: str | Path) -> CageContents:
     """Read vertices, faces, texture coordinates, materials and OpenSubdiv's tags of a Wavefront OBJ file.
 
-    Further columns of ``v`` and ``vt`` must be numbers and are dropped; a missing v of a texture coordinate is 0. Faces
-    before the first ``usemtl`` have the material "". If only some corners have texture coordinates, the cage has none.
+    Further columns of ``v`` and ``vt`` must be numbers, and are dropped; a missing v of a texture coordinate is 0.
+    Faces before the first ``usemtl`` have the material "". If only some corners have texture coordinates, the cage has
+    none.
     """
     with open(path, "rb") as file:
         obj = _ObjText.split(f'"{path}"', file.read())
@@ -83,11 +84,11 @@ def read_obj(path: str | Path) -> CageContents:
         raise obj.malformed(corners, first, _CORNER, "integers as v, v/vt, v//vn or v/vt/vn")
 
     def zero_based(indices: IntArray, counted: NDArray[np.bool_], nouns: tuple[str, str], rows: NDArray) -> IntArray:
-        """0-based indices of the face corners ``rows``; the file counts statements."""
+        """0-based indices of the face corners ``rows``, from the file's numbers."""
         count = int(counted.sum())
         if indices.min() > 0 and indices.max() <= count:
             return indices - 1
-        # Negative indices count backwards from the statements above that of the face.
+        # Negative indices count backwards from the face's statement.
         above = np.repeat(np.cumsum(counted)[is_face], sizes)[rows]
         absolute = np.where(indices > 0, indices - 1, indices + above)
         wrong = np.flatnonzero((indices == 0) | (absolute < 0) | (absolute >= count))[:1]
@@ -143,7 +144,7 @@ def _materials(obj: _ObjText, is_face: NDArray[np.bool_]) -> dict[str, IntArray]
 def _read_numbers(
     obj: _ObjText, chosen: NDArray[np.bool_], keyword: str, noun: str, columns: int, least: int
 ) -> tuple[NDArray[np.float64], IntArray]:
-    """The first ``columns`` numbers of each chosen statement, of at least ``least``, else 0; and how many it has."""
+    """The first ``columns`` numbers of each chosen statement, at least ``least``, else 0; and their number."""
     counts = obj.require_arguments(chosen, noun, least)
     if not len(counts):
         return np.zeros((0, columns)), counts
@@ -157,7 +158,7 @@ def _read_numbers(
 
 
 def _corner_indices(text: NDArray[np.uint8], corner_count: int) -> tuple[IntArray, IntArray, IntArray] | None:
-    """Vertices of face corners, which of these have texture coordinates, and which; None if a corner is malformed."""
+    """Vertices of face corners, a mask of those with texture coordinates, and these; None if a corner is malformed."""
     slash = np.flatnonzero(text == _SLASH)
     if len(slash) == 0:
         vertices = _parsed(text, np.int64, corner_count)
@@ -179,7 +180,7 @@ def _corner_indices(text: NDArray[np.uint8], corner_count: int) -> tuple[IntArra
 
 
 def _read_tags(obj: _ObjText) -> tuple[dict[str, Any], dict[str, list[int]]]:
-    """Tags as arguments of `CageContents`, and lines as `CageSource` has them; the last value of a rule counts."""
+    """Tags as arguments of `CageContents`, and their lines for `CageSource`; the last value of a rule counts."""
     statements = np.flatnonzero(obj.statements_of(b"t"))
     if not len(statements):
         return {}, {}
@@ -231,7 +232,7 @@ def _values(where: str, tag: str) -> tuple[str, list[int], list[float], list[str
 
 
 def _integer(text: str) -> int:
-    """A number of at most 64 bits. Of more digits than Python converts, `int` itself raises a ValueError."""
+    """An integer of at most 64 bits. For more digits than Python converts, `int` itself raises a ValueError."""
     value = int(text)
     if value.bit_length() > 63:
         raise ValueError(f"{text} is out of range")
@@ -239,7 +240,7 @@ def _integer(text: str) -> int:
 
 
 def _listed(where: str, name: str, integers: list[int], floats: list[float]) -> list[list[float]]:
-    """Rows of vertices or a face, each with its sharpness, which may be one for all."""
+    """Rows of vertices or a face with their sharpness, which may be one for all."""
     width, has_sharpness, expected = _LIST_TAGS[name]
     count = len(integers) // width
     if not count or len(integers) % width or len(floats) not in ((1, count) if has_sharpness else (0,)):
@@ -251,7 +252,7 @@ def _listed(where: str, name: str, integers: list[int], floats: list[float]) -> 
 
 
 def _rule(where: str, tag: str, name: str, given: list[Any]) -> dict[str, str]:
-    """The rule that a tag sets; nothing, with a warning, for an unknown value."""
+    """The rule of a tag; for an unknown value, nothing, with a warning."""
     rule, values = RULE_TAGS[name]
     kind, shown = type(next(iter(values))), f'tag "{shortened(tag.strip())}"'
     if len(given) != 1 or not isinstance(given[0], kind):
@@ -265,9 +266,9 @@ def _rule(where: str, tag: str, name: str, given: list[Any]) -> dict[str, str]:
 
 @dataclass(frozen=True, eq=False)
 class _ObjText:
-    """Bytes of an OBJ file, split into statements, the lines that are not empty.
+    """Bytes of an OBJ file, split into statements: non-empty lines.
 
-    Comments and line continuations are overwritten by spaces, so that the position of a byte gives its line.
+    Spaces replace comments and line continuations, so that the position of a byte determines its line.
     """
 
     name: str
@@ -279,12 +280,12 @@ class _ObjText:
 
     @classmethod
     def split(cls, name: str, content: bytes) -> _ObjText:
-        """Raises CageError for a file that is no text of one byte for each character, and names its format."""
+        """Raises CageError, with the name of the format, for a file that is no single-byte text."""
         for begin, what in _NO_TEXT.items():
             if content.startswith(begin):
                 raise CageError(f"{name}: the file is {what}")
         if b"\0" in content[:2]:
-            # UTF-16 without a mark has a zero beside each ASCII character.
+            # UTF-16 without a byte order mark has a zero beside each ASCII character.
             raise CageError(f"{name}: the file is binary, or text in UTF-16; expected ASCII or UTF-8")
         if content.startswith(b"\xef\xbb\xbf"):
             content = b"   " + content[3:]
@@ -300,13 +301,13 @@ class _ObjText:
                 raise CageError(f"{name}, line {line}: the file ends in a line continuation; expected another line")
             text = re.sub(rb"\\\r?\n", lambda match: b" " * len(match[0]), text)
             statement_end = np.flatnonzero(np.frombuffer(text, np.uint8) == _NEWLINE)
-        # Two bytes more, so that a keyword of two letters can be looked for at every statement.
+        # Two more bytes, so that every statement can be compared with a keyword of two letters.
         text += b"\n\n"
 
         token_start = _run_starts(np.frombuffer(text, np.uint8) > _SPACE)
         first_token = np.append(0, np.searchsorted(token_start, statement_end))
         counts = np.diff(first_token, append=len(token_start))
-        # An empty line has no token of its own: its first token is that of a later line.
+        # An empty line has no token: its first token belongs to a later line.
         starts = token_start[first_token[counts > 0]]
         return cls(name, text, line_end, starts, counts[counts > 0] - 1, not content.endswith(b"\n"))
 
@@ -314,7 +315,7 @@ class _ObjText:
         return np.searchsorted(self.line_end, positions) + 1
 
     def statements_of(self, keyword: bytes) -> NDArray[np.bool_]:
-        """Which statements have this keyword of one or two letters."""
+        """Indices of the statements with a keyword of one or two letters."""
         text = np.frombuffer(self.text, np.uint8)
         same = text[len(keyword) :].take(self.statement_start) <= _SPACE
         for place, letter in enumerate(keyword):
@@ -322,7 +323,7 @@ class _ObjText:
         return same
 
     def arguments(self, chosen: NDArray[np.bool_], keyword_length: int = 1) -> tuple[NDArray[np.uint8], int]:
-        """Bytes from the first to the last statement, with spaces around arguments, and their position in the file."""
+        """Bytes from the first to the last statement, with spaces around arguments, and their offset in the file."""
         numbers = np.flatnonzero(chosen)
         bounds = np.append(self.statement_start, len(self.text))[numbers[0] : numbers[-1] + 2]
         # Control characters count as spaces.
@@ -340,7 +341,7 @@ class _ObjText:
         return counts
 
     def malformed(self, text: NDArray[np.uint8], first: int, form: bytes, expected: str) -> CageError:
-        """An error about the first token of `arguments` that does not match ``form``; slow."""
+        """An error about the first token of `arguments` that does not match ``form``."""
         for token in re.finditer(rb"[^\x00-\x20]+", text.tobytes()):
             if not re.fullmatch(form, token[0]):
                 shown = shortened(token[0].decode("ascii", "backslashreplace"))
@@ -354,9 +355,9 @@ class _ObjText:
 
 
 def _parsed(text: NDArray[np.uint8], dtype: type[np.generic], count: int) -> NDArray | None:
-    """The ``count`` numbers of a text, or None if it holds anything else."""
+    """The ``count`` numbers of a text, or None if it contains anything else."""
     with warnings.catch_warnings():
-        # For text that is no number, older versions of NumPy warn and newer ones raise an error.
+        # For malformed numbers, older versions of NumPy warn and newer ones raise an error.
         warnings.simplefilter("error", DeprecationWarning)
         try:
             values: NDArray = np.fromstring(text.tobytes(), dtype=dtype, sep=" ")
@@ -372,7 +373,7 @@ def _run_starts(inside: NDArray[np.bool_]) -> IntArray:
 
 
 def _without_comment(match: re.Match[bytes]) -> bytes:
-    """Spaces in place of a comment; in place of a material's name from its first "#" on, what belongs to the name."""
+    """Spaces in place of a comment; after a material's "#", the part that belongs to its name."""
     text, (start, end) = match.string, match.span()
     line = text[text.rfind(b"\n", 0, start) + 1 : end]
     kept = _COMMENT_OF_NAME.split(line)[0] if _MATERIAL.match(line) else b""
@@ -382,7 +383,7 @@ def _without_comment(match: re.Match[bytes]) -> bytes:
 def write_obj(contents: CageContents, path: str | Path) -> None:
     """Write a cage to an OBJ file with all digits of its numbers, and with OpenSubdiv's tags.
 
-    Names of materials that are not one line of text are lost, and all but one material of a face.
+    Names of materials that are not one line of text are lost, and further materials of a face.
     """
     texcoords, owner = contents.texcoords, material_of_face(contents)
     if texcoords is not None and texcoords.interpolation != "face_varying":
@@ -408,7 +409,7 @@ def write_obj(contents: CageContents, path: str | Path) -> None:
         indices, corner = np.stack([indices, rows + 1], axis=1).ravel(), " %d/%d"
     form = {size: "f" + corner * size + "\n" for size in np.unique(contents.face_sizes).tolist()}
     faces = [form[size] for size in contents.face_sizes.tolist()]
-    # The last name is of faces without a material, whose index is -1.
+    # The last name is for faces without a material, whose index is -1.
     names = [*(name.replace("%", "%%") if _is_possible(name) else "" for name in contents.materials), ""]
     of_face = np.array(names, dtype=object)[owner]
     for face in np.flatnonzero(of_face != np.append([""], of_face[:-1])):
@@ -439,13 +440,13 @@ def write_obj_triangles(path: str | Path, surface: Triangles) -> None:
 
 
 def _is_possible(name: str) -> bool:
-    """Whether a ``usemtl`` statement with this name of a material is read back as it was."""
+    """Whether a ``usemtl`` statement preserves this name of a material."""
     is_comment = re.search(r"(^|\s)#(\s|$)", name)
     return name == name.strip() and name.isprintable() and not is_comment and not name.endswith("\\")
 
 
 def _number_statements(keyword: str, values: NDArray) -> Iterator[str]:
-    # 9 digits distinguish all float32 numbers. Of float64 numbers, Python itself writes the fewest digits that do.
+    # 9 digits distinguish all float32 numbers. For float64, Python writes the fewest digits that do.
     form = keyword + (" %r" if values.dtype == np.float64 else " %.9g") * values.shape[1] + "\n"
     for start in range(0, len(values), ROWS):
         rows = values[start : start + ROWS]

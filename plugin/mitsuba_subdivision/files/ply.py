@@ -27,15 +27,15 @@ if TYPE_CHECKING:
 
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 _POSITION, _NORMAL = ("x", "y", "z"), ("nx", "ny", "nz")
-# Colours and their opacity; of several in a file, the first in this order is read.
+# Names of colours and their opacity; the first in this order is read.
 _COLORS = (("red", "green", "blue", "alpha"), ("r", "g", "b", "a"))
-# Pairs for texture coordinates; of several pairs in a file, the first in this order is read, and the first is written.
+# Names of texture coordinates; the first pair in this order is read, and the first one is written.
 _TEXCOORDS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
-# Properties of faces for their material, of common files and of MeshLab; the first one in a file is read.
+# Properties of faces for their material, in common files and in MeshLab's; the first one in a file is read.
 _MATERIAL = ("material_index", "material_id", "texnumber")
 _RESERVED = {*_POSITION, *_NORMAL, *chain(*_COLORS, *_TEXCOORDS)} - {"alpha"}
 _NUMBER = "0|[1-9][0-9]{0,8}"
-# Endings of three columns of one attribute, and what follows the attribute's name.
+# Endings of the three columns of an attribute, and the addition to its name.
 _LETTERS = {"xyz": "", "rgb": "_color"}
 _TYPES = {np.dtype("<f8"): "double", np.dtype("<f4"): "float", np.dtype("<i4"): "int", np.dtype("u1"): "uchar"}
 
@@ -43,7 +43,7 @@ _TYPES = {np.dtype("<f8"): "double", np.dtype("<f4"): "float", np.dtype("<i4"): 
 def read_ply(path: str | Path) -> CageContents:
     """Read polygons, data at vertices and materials of faces of a PLY file, ASCII or binary.
 
-    Polygons are the list ``vertex_indices`` or ``vertex_index`` of the element ``face``. Normals are dropped: they
+    Polygons are the list ``vertex_indices`` or ``vertex_index`` of the element ``face``. Normals are dropped, as they
     follow from the surface. Properties of vertices become texture coordinates by `_TEXCOORDS`, or attributes by
     `grouped`; unsigned integers of colours are scaled to 0 to 1.
     """
@@ -53,14 +53,14 @@ def read_ply(path: str | Path) -> CageContents:
     lines: dict[str, IntArray] = {}
     first = 2 + len(header.splitlines())
     for word, digits in re.findall(rb"[\r\n]element\s+(\S+)\s+(\d+)", header):
-        # Plyfile makes an array of as many rows as the header announces.
+        # Plyfile allocates as many rows as the header states.
         if len(digits) > 18 or int(digits) > len(content):
             rows = shortened(f"{digits.decode()} rows of {word.decode('ascii', 'replace')}", 200)
             raise CageError(f"{name}: {rows} do not fit into the file; expected fewer")
         if not binary:
             lines[word.decode("ascii", "replace")] = first + np.arange(int(digits))  # A row is a line
             first += int(digits)
-    # When the cage is validated, numbers that are not finite become errors that name their place.
+    # Validation of the cage reports non-finite numbers with their place.
     with np.errstate(over="ignore", invalid="ignore"):
         return _contents(_elements(content, name, lines, binary), name, lines)
 
@@ -73,12 +73,12 @@ def _elements(content: bytes, name: str, lines: dict[str, IntArray], binary: boo
             f'{name}: the package plyfile, which reads PLY files, is missing; pip install "mitsuba-subdivision[files]"'
         ) from None
     with warnings.catch_warnings():
-        # For elements without rows NumPy warns, and plyfile then raises an error.
+        # NumPy warns of elements without rows, and plyfile then raises an error.
         warnings.simplefilter("ignore", UserWarning)
         # For integers with a fraction, older versions of NumPy warn and newer ones raise an error.
         warnings.simplefilter("error", DeprecationWarning)
-        # Plyfile maps lists of one known length, and reads all others row by row, in a hundred times as long. It maps
-        # a file of our own, as the process would end if another program cut a mapped file.
+        # Plyfile maps lists of one known length, and reads others row by row, a hundred times slower. It maps a copy,
+        # as the process would end if another program truncated a mapped file.
         if binary:
             with suppress(OSError), tempfile.TemporaryFile() as file:
                 file.write(content)
@@ -91,7 +91,7 @@ def _elements(content: bytes, name: str, lines: dict[str, IntArray], binary: boo
             return PlyData.read(io.BytesIO(content), mmap=False)
         except UnicodeDecodeError:
             raise CageError(f"{name}: there are bytes that are not ASCII; expected an ASCII PLY file") from None
-        # Damaged files make plyfile raise errors of its own, of Python and of NumPy.
+        # For damaged files, plyfile raises its own errors, Python's and NumPy's.
         except Exception as error:
             cut = " (is the file cut short?)" if "early end" in str(error) else ""
             row, element, line = (getattr(error, attribute, None) for attribute in ("row", "element", "line"))
@@ -123,7 +123,7 @@ def _contents(elements: PlyData, name: str, lines: dict[str, IntArray]) -> CageC
     left_out += [f'the list "{other}" of vertices' for other in lists]
     if left_out:
         warn(f"{name}: {_listed(left_out)} left out; expected numbers at vertices")
-    table = face.data[polygons]  # Each face is a row of a table or an array of its own
+    table = face.data[polygons]  # Rows of a table, or an array for each face
     sizes = np.full(len(table), table.shape[1]) if table.ndim == 2 else np.array([len(row) for row in table])
     vertices = table.astype(table.dtype.newbyteorder("=")).ravel() if table.ndim == 2 else np.concatenate(list(table))
     if vertices.dtype.kind not in "iu":
@@ -141,7 +141,7 @@ def _contents(elements: PlyData, name: str, lines: dict[str, IntArray]) -> CageC
 
 
 def _properties(element: PlyElement) -> tuple[list[str], list[str]]:
-    """Names of an element's properties that are numbers, and names of its lists."""
+    """Names of an element's numeric properties, and names of its lists."""
     lists = [known.name for known in element.properties if hasattr(known, "len_dtype")]
     return [known.name for known in element.properties if known.name not in lists], lists
 
@@ -156,7 +156,7 @@ def _materials(numbers: NDArray) -> dict[str, IntArray]:
 
 
 def _vertex_data(data: NDArray, numbers: Sequence[str]) -> tuple[Attribute | None, dict[str, Attribute]]:
-    """Texture coordinates and attributes, which are among the properties that are numbers."""
+    """Texture coordinates and attributes among the numeric properties."""
     names = [name for name in numbers if name not in (*_POSITION, *_NORMAL)]
     pair = next((pair for pair in _TEXCOORDS if set(pair) <= set(names)), ())
     names = [name for name in names if name not in pair]
@@ -169,23 +169,23 @@ def _vertex_data(data: NDArray, numbers: Sequence[str]) -> tuple[Attribute | Non
 
 
 def _columns(data: NDArray, names: Sequence[str], scaled: bool = False) -> NDArray[np.float64]:
-    """Table of properties as float64; if ``scaled``, the range of unsigned integers becomes 0 to 1."""
+    """Table of properties in float64; if ``scaled``, the range of unsigned integers becomes 0 to 1."""
     columns = [data[name] for name in names]
     highest = [np.iinfo(column.dtype).max if scaled and column.dtype.kind == "u" else 1 for column in columns]
     return np.stack([column.astype(np.float64) for column in columns], axis=1) / highest
 
 
 def _color_of(names: Sequence[str]) -> tuple[str, ...]:
-    """Properties of a colour: three, or four with its opacity; none if one is missing."""
+    """Properties of a colour, three, or four with its opacity; none if one is missing."""
     color = next((color for color in _COLORS if {*color[:3]} <= {*names}), ())
     return tuple(name for name in color if name in names)
 
 
 def grouped(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Properties of each attribute, by the attribute's name, as Mitsuba's ``ply`` names them; see `read_ply`.
+    """Properties of each attribute, by the names of Mitsuba's ``ply``; see `read_ply`.
 
-    Numbered columns are one attribute if their numbers are complete. An attribute of one column may end like the first
-    of several.
+    Numbered columns are one attribute if their numbers are complete. An attribute of one column may also end like the
+    first of several.
     """
     color = _color_of(names)
     possible = {"color": color[:3]} if color else {}
@@ -204,7 +204,7 @@ def grouped(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
             letter_count = sum(letter in members for letter in letters)
             if letters[0] in members and letter_count in (1, 3):
                 possible.setdefault(f"{stem}{ending}", tuple(members[letter] for letter in letters[:letter_count]))
-    # A property that is itself called ``name`` keeps the name to itself.
+    # A property with the exact name keeps the name.
     chosen = {name: columns for name, columns in possible.items() if name in columns or name not in names}
     owner = {column: name for name, columns in chosen.items() for column in columns}
     return {owner.get(name, name): chosen.get(owner.get(name, name), (name,)) for name in names}
@@ -213,7 +213,7 @@ def grouped(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
 def write_ply(contents: CageContents, path: str | Path) -> None:
     """Write the polygons of a cage, their materials, and its data at vertices, to a PLY file in double precision.
 
-    Names of materials other than "material_0" and so on are lost, and all but one material of a face.
+    Names of materials other than "material_0" and so on are lost, and further materials of a face.
     """
     texcoords = contents.texcoords
     if texcoords is not None and texcoords.interpolation != "vertex":
@@ -223,7 +223,7 @@ def write_ply(contents: CageContents, path: str | Path) -> None:
         for name, attribute in contents.attributes.items()
         if attribute.interpolation == "vertex" and is_possible(name)
     }
-    # Numbers of materials, as names of files that were read have them; None if a name has none.
+    # Numbers of materials, from the names that the reader gives; None if a name has none.
     matches = {name: re.fullmatch(f"material_({_NUMBER})", name) for name in contents.materials}
     numbers = {name: int(match[1]) if match else None if name else -1 for name, match in matches.items()}
     owner = material_of_face(contents)
@@ -247,7 +247,7 @@ def write_ply(contents: CageContents, path: str | Path) -> None:
     materials = None
     if numbers:
         free = (number for number in count() if number not in numbers.values())
-        # The last one is of faces without a material, whose index is -1.
+        # The last one is for faces without a material, whose index is -1.
         table = [next(free) if number is None else number for number in numbers.values()]
         materials = np.array([*table, -1])[owner]
     properties |= _columns_of(attributes)
@@ -267,7 +267,7 @@ def write_ply_triangles(path: str | Path, surface: Triangles) -> None:
 
 
 def is_possible(name: str) -> bool:
-    """Whether an attribute can be written so that it is read back as it was."""
+    """Whether writing and reading preserves an attribute."""
     return bool(re.fullmatch(r"[!-~]+", name))
 
 
@@ -285,12 +285,12 @@ def _columns_of(attributes: Mapping[str, NDArray]) -> dict[str, NDArray]:
 
 def write_polygons(
     path: str | Path,
-    properties: Mapping[str, NDArray],  # (n,) float32 or float64 each: numbers of vertices by name
+    properties: Mapping[str, NDArray],  # (n,) float32 or float64 each: values at vertices by name
     face_sizes: NDArray,
     face_vertices: NDArray,
     materials: NDArray | None = None,  # (n_f,) int: number of each face's material; negative for none
 ) -> None:
-    """Write polygons to a binary PLY file, whole or not at all."""
+    """Write polygons to a complete binary PLY file."""
     types = {name: values.dtype.newbyteorder("<") for name, values in properties.items()}
     vertices = np.empty(len(next(iter(properties.values()))), dtype=list(types.items()))
     for name, values in properties.items():

@@ -32,13 +32,13 @@ def read_usd(
     path: str | Path,
     prim: str | None = None,
     time: float | None = None,
-    rules: Mapping[str, str] | None = None,  # Rules and scheme that replace the mesh's own, which are then not read
+    rules: Mapping[str, str] | None = None,  # Rules and scheme that replace the mesh's own
 ) -> CageContents:
     """Read a mesh of a USD file, or all meshes, with subdivision attributes and primvars, in world space.
 
-    ``prim`` and ``time`` are those of `ControlCage.from_file`, and so are errors and warnings; the cage itself is not
-    validated. Faces of left-handed and of mirrored meshes are reversed, so that they are counter-clockwise from
-    outside. Skeletons and blend shapes move the points, as usd-core does.
+    ``prim``, ``time``, errors and warnings are those of `ControlCage.from_file`; the cage is not validated. Faces of
+    left-handed and mirrored meshes are reversed, to be counter-clockwise from outside. Skeletons and blend shapes move
+    the points.
     """
     name = f'"{path}"'
     if time is not None and not math.isfinite(time):
@@ -53,7 +53,7 @@ def read_usd(
         skinning = Skinning(code, lambda what, path: warn(f"{name}, prim {shortened(str(path))}: {what}"))
     contents = []
     for mesh, location in zip(meshes, locations, strict=True):
-        # Numbers that are not finite become errors that name their location.
+        # Non-finite numbers become errors that name their location.
         with usd_stage.usd_errors_at(location), np.errstate(over="ignore", invalid="ignore"):
             contents.append(MeshReader(mesh, location, skinning, rules).contents())
     return joined(contents, name)
@@ -68,18 +68,18 @@ class MeshReader:
         location: str,  # Beginning of messages
         skinning: Skinning,  # Has the time at which the mesh is read
         rules: Mapping[str, str] | None = None,  # As for `read_usd`
-        # Gets messages about attributes that are left out, and their paths; by default, these are errors
+        # Gets messages about omitted attributes and their paths; by default, they are errors
         report: Callable[[str, object], None] | None = None,
     ) -> None:
         self.mesh, self.location, self.skinning = mesh, location, skinning
         self._rules, self._report, self._source = rules or {}, report, CageSource(location)
 
     def contents(self, attributes: Collection[str] | None = None, texcoords: str | None = None) -> CageContents:
-        """The mesh as contents of a cage in the world's space, with all primvars.
+        """The mesh as contents of a cage in world space, with all primvars.
 
-        With names of attributes, the mesh is in its own space, without a scheme if it is flat, and only these primvars
-        and texture coordinates are read, values of whole faces as those of their corners. The primvar ``texcoords`` is
-        preferred for texture coordinates.
+        If names of attributes are given, the mesh is in its own space, without a scheme if it is flat, and only these
+        primvars and texture coordinates are read; values of faces become values of their corners. The primvar
+        ``texcoords`` is preferred for texture coordinates.
         """
         mesh, is_local = self.mesh, attributes is not None
         points = self.array(mesh.GetPointsAttr(), np.float64, required=True, width=3)
@@ -128,9 +128,9 @@ class MeshReader:
         )
 
     def fitting(self, attribute: Usd.Attribute, consequence: str, read: Callable[[], Read], otherwise: Read) -> Read:
-        """Read an attribute; if it does not fit the mesh, report the consequence, and return ``otherwise``.
+        """Read an attribute; if it does not fit the mesh, report the consequence and return ``otherwise``.
 
-        Without a function for reports, it is an error.
+        Without a function for reports, this is an error.
         """
         try:
             return read()
@@ -162,7 +162,7 @@ class MeshReader:
 
     @cached_property
     def _first_time(self) -> float | None:
-        """First time at which the mesh has points and faces; None if it has them anyway, or a time is given."""
+        """First time with points and faces; None if a time is given, or the mesh has them by default."""
         mesh, code = self.mesh, self.skinning.time
         # Points come last, as they take longest to read.
         needed = (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr(), mesh.GetPointsAttr())
@@ -189,7 +189,7 @@ class MeshReader:
         return array.astype(kind)
 
     def _token(self, attribute: Usd.Attribute, known: Sequence[str]) -> str:
-        """Value of an attribute among known ones; the first is the schema's fallback."""
+        """Value of an attribute from a list, which begins with the schema's fallback."""
 
         def read() -> str:
             value = str(self.value(attribute))
@@ -255,7 +255,7 @@ class MeshReader:
         return self._rows_of_mesh(np.stack([indices, sharpness], axis=1), topology, "corner")
 
     def _rows_of_mesh(self, rows: NDArray[np.float64], topology: Topology, noun: str) -> NDArray[np.float64]:
-        """Rows of creases or corners that name vertices of the mesh; among other meshes, others would be theirs."""
+        """Rows of creases or corners with valid vertices, as others would be other meshes' in a joined cage."""
         vertices, vertex_count = rows[:, :-1], topology.vertex_count
         is_inside = ((vertices >= 0) & (vertices < vertex_count)).all(axis=1)
         for row in np.flatnonzero(~is_inside)[:1]:
@@ -268,7 +268,7 @@ class MeshReader:
 
     def _local_to_world(self) -> NDArray[np.float64]:
         matrix = np.array(usd_stage.local_to_world(self.mesh.GetPrim(), self._time_of))
-        # The determinant says nothing about a matrix that is not finite.
+        # The determinant is meaningless for a non-finite matrix.
         if not np.isfinite(matrix).all() or np.linalg.det(matrix[:3, :3]) == 0:
             problem = f"the transform to world space is {shortened(str(matrix.tolist()), 200)}"
             raise self.error(problem, "an invertible matrix")
@@ -283,8 +283,8 @@ class MeshReader:
     ) -> tuple[Attribute | None, dict[str, Attribute]]:
         """Texture coordinates and attributes, from primvars of floating-point numbers.
 
-        Texture coordinates are the first of "st", "UVMap" and "texcoords", or else of type ``texCoord2``. Constants,
-        joints and normals, which follow from the surface, are skipped without a warning.
+        Texture coordinates are the first of "st", "UVMap" and "texcoords", or else one of type ``texCoord2``.
+        Constants, joints, and normals, which follow from the surface, are skipped without a warning.
         """
         from pxr import UsdGeom
 
@@ -322,7 +322,7 @@ class MeshReader:
         return texcoords, {name: values for name, values in attributes.items() if name in kept}
 
     def normals(self, cage: CageContents) -> NDArray[np.float64] | None:
-        """Authored normals of a polygon mesh in its own space, ``(n_h, 3)`` at face corners after skinning, if any."""
+        """Authored normals of a polygon mesh in its own space after skinning, ``(n_h, 3)`` at face corners, if any."""
         from pxr import UsdGeom
 
         mesh, primvar = self.mesh, UsdGeom.PrimvarsAPI(self.mesh).GetPrimvar("normals")
@@ -357,7 +357,7 @@ class MeshReader:
         topology: Topology,
         width: int | None = None,
     ) -> Attribute:
-        """An attribute of a primvar; values of whole faces or of the mesh become those of face corners."""
+        """An attribute from a primvar; values of faces or of the mesh become values of face corners."""
         where = f'{self.location}: primvar "{shortened(name)}"'
         sizes, vertices = topology.face_sizes, topology.face_vertices
         indices = None if indexed is None else self.array(indexed, np.int64)
@@ -398,10 +398,10 @@ def _table(value: Any, element_size: int) -> NDArray[np.float64] | None:
 def _with_shared_values(
     values: NDArray[np.float64], sizes: IntArray, vertices: IntArray
 ) -> tuple[NDArray[np.float64], IntArray | None]:
-    """Distinct values and the index of each face corner, where corners of a vertex share equal values.
+    """Values and the index of each face corner; corners at a vertex share equal values.
 
-    As in Blender, pairs of numbers are only shared by faces that have the same winding in their plane: a mirrored half
-    of a texture is an island of its own. Without as many values as corners, they are returned as they are.
+    As in Blender, only faces of the same winding in the texture's plane share pairs of numbers: a mirrored half is a
+    separate island. If there are not as many values as corners, they are returned unchanged.
     """
     if len(values) != len(vertices) or sizes.sum() != len(vertices) or not sizes.all():
         return values, None
@@ -421,13 +421,13 @@ def _with_shared_values(
 
 
 def reversed_order(sizes: IntArray) -> IntArray:
-    """Order of face corners that reverses the orientation of all faces and keeps their first vertices."""
+    """Order of face corners that reverses all faces and keeps their first vertices."""
     index = ragged.index_in_row(sizes)
     return np.arange(len(index)) - index + -index % np.repeat(sizes, sizes)
 
 
 def _size(value: Any) -> int:
-    """Number of entries of an array: 0 for None, and 1 for a value of another type, which is no array."""
+    """Number of entries of an array: 0 for None, and 1 for a value that is no array."""
     try:
         return len(value)
     except TypeError:

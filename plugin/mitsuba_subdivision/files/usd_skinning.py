@@ -1,4 +1,4 @@
-"""Points of USD meshes moved by skeletons and blend shapes, as the package usd-core evaluates them."""
+"""Points of USD meshes after skeletons and blend shapes, evaluated by the package usd-core."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Skinning:
     def __init__(
         self,
         time: Usd.TimeCode,
-        report: Callable[[str, object], None],  # Gets messages, and the path of the mesh
+        report: Callable[[str, object], None],  # Gets messages and the path of the mesh
     ) -> None:
         from pxr import UsdGeom, UsdSkel
 
@@ -29,7 +29,7 @@ class Skinning:
         self._transforms = UsdGeom.XformCache(time)
 
     def points(self, mesh: UsdGeom.Mesh, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points ``(n, 3)`` after blend shapes and joints, in the mesh's space; float32 where anything moves them."""
+        """Points ``(n, 3)`` after blend shapes and joints, in the mesh's space; float32 if they are moved."""
         if (query := self._query(mesh.GetPrim())) is None:
             return points
         if query.HasBlendShapes():
@@ -39,9 +39,9 @@ class Skinning:
     def normals(
         self, mesh: UsdGeom.Mesh, points: NDArray[np.float64], corners: IntArray, normals: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Normals ``(n_h, 3)`` at face corners after joints; ``corners`` (n_h,) are the points, of (n, 3), at each.
+        """Normals ``(n_h, 3)`` at face corners after joints; ``corners`` (n_h,) are indices of their points (n, 3).
 
-        Joints move each point by an affine map; its linear part is the difference of the images of shifted points.
+        Joints move each point by an affine map, whose linear part follows from images of shifted points.
         """
         if (query := self._query(mesh.GetPrim())) is None:
             return normals

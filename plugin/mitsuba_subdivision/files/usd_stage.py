@@ -1,7 +1,7 @@
-"""USD stages: opening files, values and transforms at a time, and choosing the meshes to read.
+"""USD stages: opening files, values and transforms at a time, and selection of meshes.
 
-Without a time, which the time code `EarliestTime` stands for, a value is the default, which does not depend on time, or
-else the first sample. USD itself takes the sample first, and takes the schema's fallback before it at the default time.
+Without a time (the time code `EarliestTime`), a value is the default, or else the first sample. USD itself prefers the
+sample, and at the default time the schema's fallback to the sample.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ..cage.errors import CageError, shortened, warn
 if TYPE_CHECKING:
     from pxr import Gf, Sdf, Usd, UsdGeom
 
-# Attributes of a mesh that are rules of a cage. Chaikin's rule has none.
+# Attributes of a mesh for rules of a cage. Chaikin's rule has none.
 RULE_ATTRIBUTES = {
     "boundary": "interpolateBoundary",
     "triangle_rule": "triangleSubdivisionRule",
@@ -29,11 +29,11 @@ RULE_ATTRIBUTES = {
 SCHEMES = {"catmullClark": "catmull_clark", "loop": "loop"}
 FLAT_SCHEMES = ("none", "bilinear")
 INTERPOLATIONS: dict[str, Interpolation] = {"vertex": "vertex", "varying": "varying", "faceVarying": "face_varying"}
-# Primvars that are texture coordinates by their name; the first is written.
+# Names of primvars for texture coordinates; the first is written.
 TEXCOORDS = ("st", "UVMap", "texcoords")
-HIDDEN_PURPOSES = ("guide", "proxy")  # Values of purpose for prims that renderers do not show
+HIDDEN_PURPOSES = ("guide", "proxy")  # Values of purpose that renderers do not show
 ALL = "*"  # Value of `prim` that selects every mesh in the file
-# Characters of the USD library's messages to show, and to search for a reason.
+# Characters of USD's messages to show, and to search for a reason.
 _MOST_SHOWN, _MOST_SEARCHED = 200, 10_000
 _MATERIALX = re.compile(r"Could not open asset @([^@]*\.mtlx)[@:]", re.IGNORECASE)
 
@@ -50,7 +50,7 @@ def require_usd(name: str, use: str = "reads") -> None:
 
 def open_stage(
     path: str | Path,
-    # Returns a stage with the layers that USD itself cannot open, from the stage and the beginning of messages
+    # Returns a stage with layers that USD itself cannot open, from the stage and the beginning of messages
     completed: Callable[[Usd.Stage, str], Usd.Stage] | None = None,
     over: str | Path | None = None,  # A layer that is stronger than the file
 ) -> Usd.Stage:
@@ -72,7 +72,7 @@ def open_stage(
 
 def _opened_layer(path: str | Path) -> Sdf.Layer:
     with open(path, "rb"):
-        pass  # So that a missing file is an OSError, as for other formats.
+        pass  # A missing file is an OSError, as for other formats.
     name = f'"{path}"'
     require_usd(name)
     from pxr import Sdf, Tf
@@ -83,14 +83,14 @@ def _opened_layer(path: str | Path) -> Sdf.Layer:
         except Tf.ErrorException as error:
             reason = _commentary(error)
             if where := re.match(re.escape(os.path.abspath(path)) + r":(\d+):\d+: ", reason):
-                # The parser names the rules of its grammar, which are in C++.
+                # The parser names rules of its grammar, terms of C++.
                 what = re.sub("parse error matching .* at ", "syntax error at ", reason[where.end() :], flags=re.DOTALL)
                 name, reason = f"{name}, line {where[1]}", what
             raise CageError(f"{name}: {_clear(reason)}; expected a USD file (is it damaged?)") from None
 
 
 def _sublayered(stronger: Sdf.Layer, weaker: Sdf.Layer) -> Sdf.Layer:
-    """A root layer with two sublayers, and their metadata of stages, such as the up axis."""
+    """A root layer with two sublayers and their stage metadata, such as the up axis."""
     from pxr import Sdf
 
     root = Sdf.Layer.CreateAnonymous(".usda")
@@ -138,7 +138,7 @@ def _warn_of_missing(name: str, errors: list[str]) -> None:
 
 
 def stage_up_axis(path: str | Path) -> str:
-    """Axis that points up in a USD file, "y" or "z"; errors are those of `open_stage`."""
+    """Up axis of a USD file, "y" or "z"; errors are those of `open_stage`."""
     stage = open_stage(path)
     from pxr import UsdGeom
 
@@ -164,11 +164,11 @@ def usd_errors_at(where: str) -> Iterator[None]:
 def usd_messages_of(name: str) -> Iterator[None]:
     """Turn messages of the USD library in a ``with`` block into one warning that begins with a name.
 
-    Composition errors are left out, as `open_stage` names them.
+    Composition errors are omitted, as `open_stage` reports them.
     """
     from pxr import UsdUtils
 
-    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # While it exists, it takes the messages of all threads
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()  # Takes the messages of all threads while it exists
     try:
         yield
         reports = delegate.TakeUncoalescedDiagnostics()
@@ -183,7 +183,7 @@ def usd_messages_of(name: str) -> Iterator[None]:
 
 
 def _commentary(error: Exception) -> str:
-    """Text of the first error of the library, which is the most telling one."""
+    """Text of the library's first error, the most informative one."""
     try:
         return error.args[0].commentary.strip()[:_MOST_SEARCHED]
     except UnicodeError:
@@ -191,7 +191,7 @@ def _commentary(error: Exception) -> str:
 
 
 def _clear(reason: str) -> str:
-    """A short reason, without terms of C++ and without the path, which the message names already."""
+    """A short reason, without terms of C++ and without the path, which is in the message."""
     if "std::bad_alloc" in reason or "cannot create std::vector" in reason:
         return "a number in the file asks for more memory than there is"
     what = re.sub(", while reading @[^@]*@$", "", reason.removeprefix("Encountered: "))
@@ -216,7 +216,7 @@ def value_at(attribute: Usd.Attribute, time: Usd.TimeCode) -> Any:
 
 
 def require_types(prim: Usd.Prim, time: Usd.TimeCode) -> None:
-    """Raise TypeError unless values of a prim's attributes have the types of its schema; USD reads others as none."""
+    """Raise TypeError unless a prim's attributes have the types of its schema; USD reads others as missing."""
     for attribute in prim.GetAuthoredAttributes():
         value, declared = value_at(attribute, time), attribute.GetTypeName().defaultValue
         are_numbers = isinstance(value, (int, float)) and isinstance(declared, (int, float))
@@ -232,7 +232,7 @@ def local_to_world(
 ) -> Gf.Matrix4d:
     """Transform of a prim to world space, for row vectors, with operations at their own times.
 
-    Adds the transforms of the prim and of the prims above to the known ones, by their paths.
+    Adds the transforms of the prim and its ancestors to the known ones, by path.
     """
     from pxr import Gf, UsdGeom
 
@@ -240,7 +240,7 @@ def local_to_world(
     if path not in known:
         matrix, resets = Gf.Matrix4d(1), prim.IsPseudoRoot()
         if here := UsdGeom.Xformable(prim):
-            # Times of samples are not asked for: with timeCodesPerSecond = 0, USD looks for them for ever.
+            # Not by times of samples: with timeCodesPerSecond = 0, USD never finishes its search for them.
             for operation in reversed(here.GetOrderedXformOps()):
                 matrix *= operation.GetOpTransform(time_of(operation.GetAttr()))
             resets = here.GetResetXformStack()
@@ -268,7 +268,7 @@ def chosen_meshes(
     time: Usd.TimeCode,
     scheme: str | None,  # Replaces the meshes' own
 ) -> list[UsdGeom.Mesh]:
-    """The mesh to read, or all meshes; with a warning, without flat and hidden ones if there are others."""
+    """The selected mesh, or all meshes; flat and hidden ones are skipped with a warning if there are others."""
     from pxr import Sdf, Usd, UsdGeom
 
     prims = stage.Traverse(Usd.TraverseInstanceProxies())
@@ -287,7 +287,7 @@ def chosen_meshes(
         raise CageError(f"{name}: prim {path} {what}; expected one of {_listed(meshes)}")
 
     def without(paths: list[Sdf.Path], is_skipped: Callable[[UsdGeom.Mesh], bool], why: str) -> list[Sdf.Path]:
-        """The meshes that are not skipped, with a warning about the others; all if all would be skipped."""
+        """The meshes that are not skipped, with a warning about the others; all meshes if none would remain."""
         kept = [mesh for mesh in paths if not is_skipped(meshes[mesh])]
         if kept and len(kept) < len(paths):
             warn(f"{name}: meshes {_listed(mesh for mesh in paths if mesh not in kept)} left out, as {why}")

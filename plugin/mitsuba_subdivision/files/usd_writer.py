@@ -67,7 +67,7 @@ def write_usd_triangles(path: str | Path, surface: Triangles) -> None:
 def _new_mesh(
     path: str | Path, name: str, points: NDArray, sizes: NDArray, vertices: NDArray
 ) -> Iterator[UsdGeom.Mesh]:
-    """The only mesh of a new file, which is written when the ``with`` block ends, whole or not at all."""
+    """The only mesh of a new file, which is written completely when the ``with`` block ends."""
     require_usd(f'"{path}"', "writes")
     from pxr import Tf, Usd, UsdGeom
 
@@ -110,7 +110,7 @@ def _set_primvars(mesh: UsdGeom.Mesh, texcoords: Attribute | None, attributes: d
 
 
 def _floats(values: NDArray) -> NDArray[np.float32]:
-    """Values in single precision; flat unless USD has vectors of as many numbers."""
+    """Values in single precision; flat if USD has no vectors of this size."""
     values = np.ascontiguousarray(values, dtype=np.float32)
     return values if values.ndim == 2 and values.shape[1] in (2, 3, 4) else values.ravel()
 

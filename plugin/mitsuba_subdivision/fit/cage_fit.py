@@ -1,4 +1,4 @@
-"""The fit of a cage to pictures of its limit surface, step by step."""
+"""The fit of a cage to pictures of its limit surface."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from .fitting import Fit, Schedulable, Schedule, State
 from .smoothness import LargeSteps, regularizer, rows
 from .unknown_creases import UnknownCreases
 
-# Names of the fitted shape in its scene, of its control points, and of the beginning of its attributes' names.
+# Names in the scene of the fitted shape and its control points, and prefix of its attributes.
 SHAPE = "surface"
 CONTROL_POINTS, CAGE_VALUES, TEXCOORDS = f"{SHAPE}.control_points", f"{SHAPE}.cage_", "texcoords"
-# The optimiser's names of the coordinates of control points, and of the sharpness of creases.
+# Variables of the optimiser: coordinates of control points, and sharpness of creases.
 U, SHARPNESS = "u", "sharpness"
-# Where outlines move, gradients need an integrator that knows of them. There are shadows, but few scenes need theirs.
+# Moving outlines need a projective integrator. Few scenes need gradients of shadows.
 DEFAULT_INTEGRATOR = {"type": "direct_projective", "sppi": 0}
 DEFAULT_SHAPE = {"tessellation_rate": 4}
 
 Loss = Literal["l1", "l2"] | Callable[["mi.TensorXf", int], "mi.TensorXf"]
-# A surface of this size, in that of the initial one, has collapsed: its triangles have no area in single precision.
+# Size relative to the initial surface at which triangles have no area in single precision.
 COLLAPSED = 1e-4
-# Large steps reach their full λ from as many control points on, those of a cube refined twice. With fewer, each moves
-# much of a surface that is smooth already, and λ would only slow what neighbours do against each other.
+# Number of control points, of a cube refined twice, from which λ has its full value. Fewer control points have a smooth
+# surface, and λ would only slow opposed motions of neighbours.
 MANY_POINTS = 98
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A picture, and the sensor that took it.
+    """A picture and its sensor.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class View:
     picture : (height, width, channels) array, mi.Bitmap, or path of a file
         In linear light, with the channels of the film; bitmaps are converted.
     mask : (height, width) array, optional
-        Weight of each pixel; 0 where the picture is not to be compared.
+        Weight of each pixel; 0 to ignore it.
     """
 
     sensor: Any
@@ -67,7 +67,7 @@ def with_sample_count(sensor: Mapping[str, Any] | mi.Sensor, spp: int) -> mi.Sen
 
 
 def _loaded(view: View, where: str, spp: int) -> tuple[mi.Sensor, mi.TensorXf, mi.TensorXf]:
-    """The sensor of a view, and its picture and mask on the device, checked; a mask of ones if it has none."""
+    """The sensor of a view, and its validated picture and mask on the device; by default, a mask of ones."""
     sensor = with_sample_count(view.sensor, spp)
     width, height = map(int, sensor.film().crop_size())
     picture = mi.Bitmap(str(view.picture)) if isinstance(view.picture, (str, Path)) else view.picture
@@ -89,53 +89,52 @@ def _loaded(view: View, where: str, spp: int) -> tuple[mi.Sensor, mi.TensorXf, m
 class CageFit(Fit):
     """Fits a cage to images by moving its control points.
 
-    Every step renders all views into one graph, differentiates it once, and moves the points by Adam, in coordinates in
-    which steps are large and smooth (`LargeSteps`). From coarse to fine, the cage is refined on the way: its surface
-    stays, and control points become four times as many.
+    Every step renders all views into one graph, differentiates it once, and moves the points by Adam in the coordinates
+    of `LargeSteps`. From coarse to fine, the cage is refined during the fit: the surface stays, with four times as many
+    control points.
 
     Parameters
     ----------
     cage : ControlCage
-        Where to begin. Its topology, tags and rules stay, but for refinement.
+        Initial cage. Topology, tags and rules change only by refinement.
     views : sequence of View
     scene : dict
-        The scene besides the surface, as for ``mi.load_dict``: emitters, other shapes, and the
-        integrator if it is not to be ``direct_projective``.
+        The scene without the surface, as for ``mi.load_dict``: emitters, other shapes, and an integrator, by default
+        ``direct_projective``.
     shape : dict, optional
-        Parameters of the shape besides its cage, such as its ``bsdf`` and ``tessellation_rate``, 4 by default.
+        Parameters of the shape without its cage, such as ``bsdf`` and ``tessellation_rate`` (4 by default).
     scheme : str, optional
         By default that of the cage, or Catmull-Clark.
     loss : "l1", "l2" or callable
         Mean absolute difference of pictures, which noise biases, or squared difference; or a differentiable function of
         a picture and the index of its view.
     learning_rate : float or schedule
-        How far a step moves the points at most, about, in diagonals of the box around ``cage``.
+        Largest motion of points in a step, approximately, in diagonals of the box around ``cage``.
     smoothing : float
-        How far steps reach, as λ of `LargeSteps`; 0 to move each point for itself. Cages of n < 98 control points have
-        (n / 98)² of it, until they are refined.
+        λ of `LargeSteps`; with 0, points move independently. It is multiplied by (n / 98)² for n < 98 control points.
     laplacian : "cage" or "surface"
-        Whose Laplacian smooths steps: that of the cage's edges, or of the limit surface where the fit begins.
+        Laplacian of `LargeSteps`: of the cage's edges, or of the initial limit surface.
     sharp_edges : (n, 2) array of int, optional
-        0-based ends of edges whose sharpness is fitted as well, from that which ``cage`` has. When the cage is refined,
-        their halves have one less, or 0.
+        0-based ends of edges whose sharpness is also fitted, from its value in ``cage``. Refinement decreases it by
+        one, down to 0.
     crease_of : (n,) array of int, optional
-        Which crease each of these edges belongs to, 0-based: edges of a crease have one sharpness, which begins as the
-        mean of theirs. By default each edge is a crease of its own.
+        0-based crease of each of these edges. Edges of a crease have one sharpness, initially the mean. By default each
+        edge is a separate crease.
     highest_sharpness : int
-        Upper bound of the sharpness, 1 to 6; one less after each refinement, but 1 at least. The shape's cage is then
-        one that is refined as often: see `UnknownCreases`.
+        Upper bound of the sharpness, 1 to 6; refinement decreases it by one, down to 1. The shape's cage is refined as
+        many times: see `UnknownCreases`.
     sharpness_rate : float or schedule
-        How far a step moves a sharpness at most, about.
+        Largest change of sharpness in a step, approximately.
     regularizers : dict of str to float or schedule, optional
         Weights of terms that keep the cage even: "laplacian" (of the cage), "bending" (of the limit surface), "anchor"
-        (where the points began) and "folds" (of faces onto their neighbours).
+        (initial positions) and "folds" (of neighbouring faces).
     others : dict of str to float or schedule, optional
         Learning rates of other parameters of the scene, by their names in `mi.traverse`. The shape's begin with
         "surface", such as "surface.bsdf.reflectance.value", and "surface.cage_NAME" for an attribute of the cage.
     refine : sequence of int, or int
-        Steps before which the cage is refined; or how often, each time when the loss has stopped falling.
+        Steps before which the cage is refined; or the number of refinements, each when the loss has stopped falling.
     spp, edge_spp : int
-        Samples of each pixel, and of outlines for each pixel.
+        Samples per pixel, and samples of outlines per pixel.
     seed : int
     callbacks : sequence of callable
         Called with the fit after each step.
@@ -147,7 +146,7 @@ class CageFit(Fit):
     CageError, SchemeError
         As `LimitSurface`; from `step`, if a cage cannot be refined.
     RuntimeError
-        From `step`, if the loss is not finite, or the step has moved all control points to one place.
+        From `step`, if the loss is not finite, or all control points are in one place.
     """
 
     def __init__(
@@ -190,7 +189,7 @@ class CageFit(Fit):
         self._entries = {"type": "scene", "integrator": DEFAULT_INTEGRATOR, **scene}
         integrator = self._entries["integrator"]
         if isinstance(integrator, Mapping) and str(integrator.get("type", "")).endswith("_projective"):
-            # Counts for derivatives, unless it has its own.
+            # Used for derivatives, unless the integrator has its own.
             self._entries["integrator"] = {"sppc": spp, "sppp": edge_spp, **integrator}
         loaded = [_loaded(view, f"view {index}", spp) for index, view in enumerate(views)]
         self._sensors, self._targets, self._masks = zip(*loaded, strict=True)
@@ -212,7 +211,7 @@ class CageFit(Fit):
         creases = self._creases
         cage, halvings = start.cage, 0
         if creases is not None:
-            # Refined several times: its edges have half as many segments each time.
+            # Each refinement halves the segments of edges.
             cage, halvings = creases.refined, creases.highest
             self._others[SHARPNESS] = upload(mi.Float, creases.initial)
         rate = max(1, self._shape["tessellation_rate"] >> halvings)
@@ -233,7 +232,7 @@ class CageFit(Fit):
                 raise ValueError(f'others has "{name}"; expected one of {", ".join(self._params.keys())}')
             if name.startswith(CAGE_VALUES) and creases is not None:
                 raise ValueError(f'others has "{name}", and sharp_edges are given; expected one of them')
-            # An earlier start may have set it in the same size.
+            # An earlier start may have set it with the same size.
             if name not in self._others or self._others[name].shape != self._params[name].shape:
                 self._others[name] = self._params[name]
 
@@ -267,7 +266,7 @@ class CageFit(Fit):
     def sharp_edges(self) -> IntArray:
         """``(n, 2)`` 0-based ends of the edges of `cage` whose sharpness is fitted; maybe empty.
 
-        After a refinement these are the halves at the first ends, then those at the second ends.
+        After a refinement: the halves at the first ends, then the halves at the second ends.
         """
         return np.empty((0, 2), dtype=np.int64) if self._creases is None else self._creases.edges
 
@@ -299,7 +298,7 @@ class CageFit(Fit):
         for name in self._other_names:
             self._params[name] = self._others[name]
         self._params.update()
-        # One graph of all views, so that one `dr.backward` reaches whatever the values were computed from.
+        # One graph of all views, so that one `dr.backward` reaches the variables that the values depend on.
         compare = self._loss if callable(self._loss) else self._difference
         seed = self._seed + number
         loss = loss_of_views(self._scene, self._params, compare, self._sensors, seed=seed, spp=0) / len(self._sensors)
@@ -328,7 +327,7 @@ class CageFit(Fit):
         return dr.mean(size * self._masks[view], axis=None)
 
     def _extent(self) -> float:
-        """Diagonal of the box around the optimiser's variables: 0 where all control points are at one place."""
+        """Diagonal of the box around the optimiser's variables: 0 if all control points are in one place."""
         return float(np.linalg.norm(np.ptp(rows(self._optimizer[U]), axis=0)))
 
     def _state(self) -> State:
@@ -336,7 +335,7 @@ class CageFit(Fit):
         for name in self._other_rates:
             state |= _adam_state(self._others, name, f"other {name}")
         if self._creases is not None:
-            # The refined cage depends on the sharpness at that time.
+            # The refined cage depends on the current sharpness.
             state |= {"start: positions": self._start.positions, "start: sharpness": self._creases.initial}
         return state
 
@@ -351,7 +350,7 @@ class CageFit(Fit):
 
 
 def _adam_state(optimizer: mi.ad.Optimizer, name: str, prefix: str) -> dict[str, NDArray]:
-    """A variable of ``mi.ad.Adam``, with the moving averages of its gradient and of that squared."""
+    """A variable of ``mi.ad.Adam``, with the moving averages of its gradient and squared gradient."""
     value, _, _, (steps, first, second, *_) = optimizer.state[name]
     fields = {"value": value, "steps": steps, "first": first, "second": second}
     return {f"{prefix}: {field}": np.array(values) for field, values in fields.items()}

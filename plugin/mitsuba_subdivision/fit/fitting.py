@@ -1,4 +1,4 @@
-"""The base of all fits of cages: steps, refinement on the way, checkpoints, schedules."""
+"""The base of all fits of cages: steps, refinement, checkpoints, schedules."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from ..whole_file import whole_file
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-# A loss has stopped falling when its means over this many steps and over as many before differ by less than this part.
+# Steps in a mean of the loss, and relative decrease between two means below which the loss has stopped falling.
 STEPS_OF_MEAN, LEAST_FALL = 10, 0.02
 
-FORMAT = 2  # Layout of checkpoints, and what their numbers mean: those of control points depend on λ of large steps
+FORMAT = 2  # Version of checkpoints; their coordinates of control points depend on λ of large steps
 
-State = Mapping[str, NDArray]  # What steps have changed: arrays by their names, "variable: field"
-# A number, or what users may give instead.
+State = Mapping[str, NDArray]  # State of a fit: arrays by name, "variable: field"
+# A number, or a schedule of users.
 Schedulable = float | Sequence[tuple[float, float]] | Callable[[int], float]
 
 
 class Fit(ABC):
-    """A fit, step by step: the base of `CageFit` and `PointFit`, which have these parameters.
+    """The base of `CageFit` and `PointFit`, which have these parameters.
 
     Attributes
     ----------
     losses : list of float
-        Step by step, each before the step.
+        Loss before each step.
     refinements : int
-        How often the cage has been refined so far.
+        Number of refinements so far.
     """
 
     def __init__(
@@ -55,23 +55,23 @@ class Fit(ABC):
         self.losses: list[float] = []
         self.refinements = 0
         self._since = 0  # Steps since the last refinement
-        self._start = cage  # With the initial control points, refined as often as the cage
+        self._start = cage  # With the initial control points, refined like the cage
         self._load(LimitSurface(cage, scheme), cage.positions)
 
     @abstractmethod
     def _load(self, start: LimitSurface, positions: FloatArray) -> None:
-        """Start from some control points, of a cage whose initial surface is `start`."""
+        """Start from control points of a cage whose initial surface is `start`."""
 
     @abstractmethod
     def _step(self, number: int) -> float:
-        """Take a step, whose number counts from 0, and return the loss before it."""
+        """Take a step, numbered from 0, and return the loss before it."""
 
     def _follow(self, refinement: CageRefinement) -> None:  # noqa: B027 - not all fits have any
-        """Update the state that a refinement changes besides control points; `_load` comes next."""
+        """Update the state after a refinement, except control points; `_load` comes next."""
 
     @abstractmethod
     def _state(self) -> State:
-        """State that steps have changed."""
+        """State that steps change."""
 
     @abstractmethod
     def _restore(self, state: State) -> None:
@@ -93,7 +93,7 @@ class Fit(ABC):
         Raises
         ------
         CageError, SchemeError
-            If the cage is due to be refined and cannot be: see `ControlCage.refinement`.
+            If a due refinement of the cage is impossible: see `ControlCage.refinement`.
         """
         number = len(self.losses)
         if self._is_time_to_refine(number):
@@ -106,14 +106,14 @@ class Fit(ABC):
         return loss
 
     def run(self, steps: int, checkpoint: str | Path | None = None, every: int = 50) -> Self:
-        """Take some steps; on a terminal, a line counts them.
+        """Take some steps, and count them on a terminal.
 
         Parameters
         ----------
         steps : int
         checkpoint : path, optional
-            Of a file that `save_checkpoint` writes after every ``every`` steps, and at the end; also of the last
-            complete step, if Ctrl-C interrupts.
+            File for `save_checkpoint` after every ``every`` steps, at the end, and after Ctrl-C, of the last complete
+            step.
         every : int
         """
         if checkpoint is None:
@@ -128,7 +128,7 @@ class Fit(ABC):
                 if number % every == 0 or number == steps:
                     _save(checkpoint, complete)
         except KeyboardInterrupt:
-            # A callback is interrupted after its step.
+            # Interruptions of callbacks come after the step.
             _save(checkpoint, self._arrays() if len(self.losses) > len(complete["losses"]) else complete)
             raise
         return self
@@ -142,7 +142,7 @@ class Fit(ABC):
         return bool(now > (1 - LEAST_FALL) * before)
 
     def refine(self) -> None:
-        """Refine the cage once: the same surface, with four times as many control points, about.
+        """Refine the cage once: the same surface, with about four times as many control points.
 
         Raises
         ------
@@ -157,7 +157,7 @@ class Fit(ABC):
         self._load(LimitSurface(self._start, self._scheme), refinement.cage.positions)
 
     def save_checkpoint(self, path: str | Path) -> None:
-        """Write the state that `resume` needs.
+        """Write the state for `resume`.
 
         Raises
         ------
@@ -168,7 +168,7 @@ class Fit(ABC):
 
     def _arrays(self) -> dict[str, Any]:
         counts = {"refinements": self.refinements, "since": self._since}
-        # A copy, as later steps lengthen the list.
+        # A copy, as later steps extend the list.
         return {"format": FORMAT, "losses": list(self.losses), **counts, **self._state()}
 
     def resume(self, path: str | Path) -> Self:
@@ -177,7 +177,7 @@ class Fit(ABC):
         Raises
         ------
         ValueError
-            If the file is no checkpoint, or one of another fit.
+            If the file is no checkpoint of such a fit.
         OSError
             If the file cannot be read.
         """
@@ -210,7 +210,7 @@ def _save(path: str | Path, arrays: dict[str, Any]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
-    """A number at every step, as a function of the step; `of` makes it of what users give."""
+    """A number as a function of the step."""
 
     function: Callable[[int], float]
 
@@ -218,13 +218,13 @@ class Schedule:
     def of(cls, given: Schedulable, name: str) -> Schedule:
         """A schedule of a number, of pairs ``(step, value)``, or of a function.
 
-        Steps are in increasing order, counted from 0. Between two of them, the values lie on a line; on an exponential,
-        if all are positive. Before the first and after the last step they stay.
+        Steps increase, counted from 0. Interpolation is linear, or exponential if all values are positive. Values
+        before the first and after the last step are constant.
 
         Raises
         ------
         ValueError
-            If it is none of these, or if steps do not increase; the message has the name.
+            For any other value, or if steps do not increase; the message contains the name.
         """
         if callable(given):
             return cls(given)

@@ -1,4 +1,4 @@
-"""The fit of a cage to points, of a scan or of a dense mesh: a surface with few control points."""
+"""The fit of a cage to points of a scan or a dense mesh."""
 
 from __future__ import annotations
 
@@ -20,45 +20,45 @@ from ..surface import LimitSurface
 from .fitting import Fit, Schedulable, Schedule, State
 from .smoothness import quadratic_form
 
-POINTS = "points: value"  # In checkpoints
-# Parts of the surface have no points nearby if these are further away than this many median distances between points.
-# Gaps between random points are smaller.
+POINTS = "points: value"  # Name in checkpoints
+# Distance beyond which a part of the surface has no points nearby, in median distances between points; gaps between
+# random points are smaller.
 NEAR = 5.0
-DAMPING = 1e-8  # Weight that holds each control point where it is, relative to the mean weight of points
-POINTS_PER_CONTROL_POINT = 8  # Points on the mesh for each control point that the fit ends with, by default
+DAMPING = 1e-8  # Weight of the current position of each control point, relative to the mean weight of points
+POINTS_PER_CONTROL_POINT = 8  # Default number of points on the mesh for each final control point
 
 
-# Points of the surface, as (s, n) weights over control points; their targets, (s, 3); and unit normals, (s, 3), along
-# which distances count in full, zero where there is none.
+# Points of the surface, as (s, n) weights of control points; targets, (s, 3); and unit normals, (s, 3), or zero, along
+# which distances have their full weight.
 Pairs = tuple[sparse.csr_array, FloatArray, FloatArray]
 
 
 class PointFit(Fit):
     """Fits the limit surface of a cage to points by moving its control points.
 
-    Every step finds the point of the exact surface that is nearest to each given one. If ``both_ways``, it also finds
-    parts of the surface with no given point nearby, and the points that are nearest to these. Then it moves the control
-    points to where the sum of the squared distances of these pairs is least, all at once: by sparse least squares
-    through limit stencils. Along the surface pairs may slide: there distances count less [Chen and Medioni 1992].
+    Every step finds the nearest point of the exact surface for each given point. If ``both_ways``, it also pairs parts
+    of the surface without a given point nearby with the nearest given points. Then it moves all control points to the
+    least sum of squared distances of these pairs, by sparse least squares with limit stencils. Distances along the
+    surface have a lower weight, so that pairs can slide [Chen and Medioni 1992].
 
     Parameters
     ----------
     cage : ControlCage
-        Where to begin, near the points. Its topology, tags and rules stay, but for refinement.
+        Initial cage, near the points. Topology, tags and rules change only by refinement.
     points : (m, 3) array
     normals : (m, 3) array, optional
-        Of the points. Then those whose normal is more than a right angle from that of the surface are no pair.
+        Of the points. Points and parts of the surface with more than a right angle between normals are not paired.
     scheme : str, optional
         By default that of the cage, or Catmull-Clark.
     sliding : float or schedule
-        Weight of squared distances along the surface, relative to those across; at 1, pairs do not slide.
+        Weight of squared distances along the surface, relative to the weight across; with 1, pairs do not slide.
     both_ways : bool
-        Whether the surface is to lie at the points everywhere; not for scans with holes.
+        Whether all of the surface must be near points; not for scans with holes.
     regularizers : dict of str to float or schedule, optional
-        Weights of terms that keep the cage even, in squares of the diagonal of the box around the points: "laplacian"
-        (of the cage), "bending" (of the limit surface; 1e-8 if it is not given) and "anchor" (of initial positions).
+        Weights of terms that keep the cage even, in squared diagonals of the box around the points: "laplacian" (of the
+        cage), "bending" (of the limit surface; 1e-8 by default) and "anchor" (initial positions).
     refine : sequence of int, or int
-        Steps before which the cage is refined; or how often, each time when the loss has stopped falling.
+        Steps before which the cage is refined; or the number of refinements, each when the loss has stopped falling.
     seed : int
     callbacks : sequence of callable
         Called with the fit after each step.
@@ -68,7 +68,7 @@ class PointFit(Fit):
     losses : list of float
         Mean squared distance of pairs before each step, in the units of the points.
     refinements : int
-        How often the cage has been refined so far.
+        Number of refinements so far.
 
     Raises
     ------
@@ -93,7 +93,7 @@ class PointFit(Fit):
         callbacks: Sequence[Callable[[PointFit], None]] = (),
     ) -> None:
         self._points = _checked(points, "points")
-        # Only their signs in products with other normals count.
+        # Only the signs of products with other normals matter.
         self._normals = None if normals is None else _checked(normals, "normals")
         if self._normals is not None and len(self._normals) != len(self._points):
             raise ValueError(f"{len(self._normals)} normals of {len(self._points)} points; expected one of each")
@@ -137,7 +137,7 @@ class PointFit(Fit):
         return sparse.csr_array(sparse.vstack(weights)), np.concatenate(goals), np.concatenate(across)
 
     def _paired(self, surface: LimitSurface, at: ClosestPoints | AreaSamples, goal: IntArray) -> Pairs:
-        """Pair locations on a surface with their target points, given by index; -1 or another normal: none."""
+        """Pairs of surface locations and target points, by index; none for -1, or for opposed normals."""
         is_pair = goal >= 0
         if self._normals is not None:
             is_pair &= (at.n * self._normals[goal]).sum(axis=1) >= 0
@@ -154,14 +154,14 @@ class PointFit(Fit):
 def _least_squares(
     pairs: Pairs, sliding: float, terms: Sequence[tuple[float, sparse.csr_array, FloatArray]], before: FloatArray
 ) -> FloatArray:
-    """Control points of least mean squared distance, with tangential distances weighted less, plus regularizers."""
+    """Control points of least mean squared distance, with low weights of tangential distances, and regularizers."""
     weights, goals, across = pairs
     # (s, 3, 3) quadratic forms of squared distances.
     along = np.where(across.any(axis=1), sliding, 1)[:, None, None]
     forms = (along * np.eye(3) + (1 - along) * across[:, :, None] * across[:, None, :]) / len(goals)
     blocks: list[list[Any]] = [[weights.T @ weights.multiply(forms[:, i, j, None]) for j in range(3)] for i in range(3)]
     right = np.stack([weights.T @ (forms[:, i] * goals).sum(axis=1) for i in range(3)])
-    # Control points that no pair and no term affects stay where they are.
+    # Control points without pairs and terms stay.
     damping = DAMPING * np.mean([block[i].diagonal().mean() for i, block in enumerate(blocks)])
     for axis in range(3):
         blocks[axis][axis] = blocks[axis][axis] + damping * sparse.eye_array(len(before))
@@ -194,19 +194,19 @@ def to_mesh(
     seed: int = 0,
     **options: Any,
 ) -> ControlCage:
-    """Fit a cage to a mesh of triangles: from a scan or a sculpt to a few control points.
+    """Fit a cage to a mesh of triangles, such as a scan or a sculpture.
 
     Parameters
     ----------
     cage : ControlCage
-        Where to begin, near the mesh.
+        Initial cage, near the mesh.
     positions : (n, 3) array
     triangles : (m, 3) int array
         0-based, counter-clockwise from outside.
     steps : int
         Of `PointFit`.
     count : int, optional
-        Points on the mesh, uniform by area; by default eight for each control point in the end.
+        Points on the mesh, uniform by area; by default eight for each final control point.
     seed : int
     **options
         Of `PointFit`, such as ``refine``.

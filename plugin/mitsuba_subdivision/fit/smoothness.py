@@ -1,8 +1,8 @@
-"""What keeps a fitted cage even: coordinates in which steps are large and smooth, and regularizers.
+"""Large steps, which move neighbours together, and regularizers keep a fitted cage even.
 
-A gradient of pictures moves the few points that pictures see. In the coordinates u = (I + λ L) x, with the Laplacian L
-of a mesh [Nicolet et al. 2021], the same step also moves their surroundings: in x it is the step times
-the inverse of the matrix. Here L may be that of the cage's edges, or the stiffness matrix of the limit surface.
+A gradient of pictures moves only points that affect pictures. In the coordinates u = (I + λ L) x, with the Laplacian L
+of a mesh [Nicolet et al. 2021], a step also moves their neighbourhood: in x it is multiplied by the inverse of the
+matrix. L is the Laplacian of the cage's edges, or the stiffness matrix of the limit surface.
 """
 
 from __future__ import annotations
@@ -23,18 +23,17 @@ from ..kernels.linear_maps import SparseMatrix, attached
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
 
-# Regularizers that are half of ``(x - x0)^T Q (x - x0)``, added up over the coordinates of control points x, and the
-# others.
+# Regularizers of the form ``(x - x0)^T Q (x - x0) / 2``, summed over the coordinates of control points x, and others.
 QUADRATIC, FOLDS = ("laplacian", "bending", "anchor"), "folds"
-# Faces count from this cosine between their normals on, 107 degrees. Where a part is about to grow, those on both sides
-# of its end turn by a right angle and more.
+# Cosine of the least penalised angle between normals, 107 degrees: at the tips of growing parts, faces turn by a right
+# angle and more.
 LEAST_COSINE = -0.3
 
 
 class LargeSteps:
     """Differentiable change between control points and large-step coordinates.
 
-    It stands in for ``mitsuba.ad.LargeSteps``, which requires a mesh of triangles.
+    It replaces ``mitsuba.ad.LargeSteps``, which requires a mesh of triangles.
 
     Parameters
     ----------
@@ -42,7 +41,7 @@ class LargeSteps:
         Symmetric and positive semi-definite, with constants in its null space: `ControlCage.laplacian` or
         `LimitSurface.stiffness`.
     lambda_ : float
-        How far steps reach: more than 0. Where it is large, all of the surface moves together.
+        Smoothing of steps, above 0. With a large value, all of the surface moves together.
 
     Raises
     ------
@@ -54,12 +53,12 @@ class LargeSteps:
         if not lambda_ > 0:
             raise ValueError(f"lambda_ is {lambda_}; expected a positive number")
         self.matrix = sparse.csr_array(sparse.eye_array(laplacian.shape[0]) + lambda_ * laplacian)
-        # Pivots of a positive definite matrix are on its diagonal: the factors are those of Cholesky, but for a scale.
+        # For a positive definite matrix, pivots on the diagonal suffice: the factors are Cholesky's up to a scale.
         options = {"SymmetricMode": True, "DiagPivotThresh": 0.0}
         self._factors = splu(self.matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", options=options)
 
     def to_differential(self, points: dr.ArrayBase | NDArray) -> mi.Float:
-        """Large-step coordinates of control points, flat x, y, z; not differentiable, as they are computed once.
+        """Large-step coordinates of control points, flat x, y, z; not differentiable.
 
         Parameters
         ----------
@@ -72,8 +71,8 @@ class LargeSteps:
         return upload(mi.Float, self.matrix @ rows(points))
 
     def from_differential(self, u: dr.ArrayBase) -> mi.Float:
-        """Control points, flat x, y, z, of large-step coordinates; differentiable in forward and reverse mode."""
-        # As the matrix is symmetric, derivatives pass through the same solution in both directions.
+        """Control points, flat x, y, z, from large-step coordinates; differentiable in forward and reverse mode."""
+        # The matrix is symmetric, so derivatives in both directions use the same solver.
         return attached(self._solved(dr.detach(u)), u, self._solved, self._solved)
 
     def _solved(self, flat: dr.ArrayBase) -> mi.Float:
@@ -81,15 +80,15 @@ class LargeSteps:
 
 
 def rows(points: dr.ArrayBase | NDArray) -> FloatArray:
-    """Points ``(n, 3)``, given as such or flat."""
+    """Points ``(n, 3)`` from an array of this shape or a flat one."""
     return np.array(points, dtype=np.float64).reshape(-1, 3)
 
 
 def quadratic_form(name: str, start: LimitSurface) -> tuple[sparse.csr_array, FloatArray]:
-    """Return Q and x0 of a quadratic regularizer, ``(n, n)`` and ``(n, 3)``, for a surface as a fit begins.
+    """Return Q and x0 of a quadratic regularizer, ``(n, n)`` and ``(n, 3)``, for the initial surface of a fit.
 
-    "laplacian" is the mean squared distance of control points from the mean of their neighbours, "anchor" that from
-    their initial positions. Raises ValueError for other names.
+    "laplacian" is the mean squared distance of control points from the mean of their neighbours, "anchor" from their
+    initial positions. Raises ValueError for other names.
     """
     _require_name(name, QUADRATIC)
     points, count = start.cage.positions, start.cage.vertex_count
@@ -101,27 +100,27 @@ def quadratic_form(name: str, start: LimitSurface) -> tuple[sparse.csr_array, Fl
 
 
 def regularizer(name: str, start: LimitSurface) -> Callable[[dr.ArrayBase], mi.Float]:
-    """Term that keeps a cage even, as a loss of control points on the device, for other optimisations.
+    """Term that keeps a cage even, as a differentiable loss of control points, for other optimisations.
 
     Parameters
     ----------
     name : "laplacian" | "bending" | "anchor" | "folds"
         As in `CageFit`.
     start : LimitSurface
-        Where the optimisation begins: "anchor" measures distances from its control points, "bending" derivatives in its
-        metric, see `LimitSurface.bending`.
+        Initial surface: "anchor" measures distances from its control points, "bending" uses its metric, see
+        `LimitSurface.bending`.
 
     Returns
     -------
     callable
-        Maps control points, a flat ``mi.Float`` of x, y, z of each such as the shape's parameter ``control_points``, to
-        a ``mi.Float`` of one number, differentiable by them. "laplacian", "bending" and "anchor" are half a sum of
-        squares, for a mean over control points or an integral over the surface.
+        Maps control points, a flat ``mi.Float`` such as the shape's parameter ``control_points``, to a ``mi.Float`` of
+        one number. "laplacian", "bending" and "anchor" are half a sum of squares, as a mean over control points or an
+        integral over the surface.
 
     Raises
     ------
     ValueError
-        If there is none of that name.
+        For an unknown name.
     """
     _require_name(name, (*QUADRATIC, FOLDS))
     if name == FOLDS:
@@ -131,7 +130,7 @@ def regularizer(name: str, start: LimitSurface) -> Callable[[dr.ArrayBase], mi.F
 
     def energy(points: dr.ArrayBase) -> mi.Float:
         away = points - origin
-        # The derivative of the form is the product, which need not be differentiated.
+        # The product is the derivative of the form.
         product = matrix.product(dr.detach(away))
         return dr.dot(away, product) - dr.dot(dr.detach(away), product) / 2
 
@@ -144,14 +143,14 @@ def _require_name(name: str, names: tuple[str, ...]) -> None:
 
 
 def folds(cage: ControlCage) -> Callable[[dr.ArrayBase], mi.Float]:
-    """Penalty of folds between neighbouring faces: a function of control points, flat x, y, z, differentiable by them.
+    """Penalty of folds between neighbouring faces, as a differentiable function of flat control points.
 
-    The mean over edges between two faces of ``max(0, -0.3 - cos a)^2``, where a is the angle between normals: between
-    those of the two quadrilaterals, or triangles, that the edge makes with the next vertices around each face.
+    The mean over inner edges of ``max(0, -0.3 - cos a)^2``, where a is the angle between the normals of the two
+    quadrilaterals or triangles of the edge and its next vertices in each face.
     """
     t = cage.topology
     half_edges = np.flatnonzero(t.twin > np.arange(t.half_edge_count))
-    # For the faces of each edge, vertices around it: one before it, the ends, and one after it, maybe the first one.
+    # For both faces of each edge: the vertex before it, its ends, and the vertex after it, which may be the first one.
     sides = [
         [upload(mi.UInt32, t.face_vertices[corners]) for corners in (t.prev[h], h, t.next[h], t.next[t.next[h]])]
         for h in (half_edges, t.twin[half_edges])

@@ -1,8 +1,8 @@
-"""Creases whose sharpness is fitted.
+"""Creases of unknown sharpness.
 
-Where no sharpness is above an integer k, nothing semi-sharp is left after k refinements: the limit surface is that of a
-smooth cage, always of the same faces, whose control points are a matrix times those of the cage. Between two integers,
-the matrix is linear in each sharpness (with Chaikin's method, in parts), so that a difference is its derivative.
+If no sharpness is above an integer k, nothing is semi-sharp after k refinements: the limit surface is that of a smooth
+cage of constant topology, whose control points are a matrix times the cage's. Between two integers, the matrix is
+linear in each sharpness (piecewise with Chaikin's method), so that its derivative is a difference.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from ..refinement.cage_refinement import CageRefinement, built
 from ..schemes.domain import FloatArray
 from .smoothness import rows
 
-MOST_REFINEMENTS = 6  # More refinements than these would make a thousand faces and more of each
-# Step of differences by sharpness, and their distance from an integer. Rounding leaves 1e-10 of it.
+MOST_REFINEMENTS = 6  # With more refinements, each face would become more than a thousand
+# Step of differences of sharpness, and least distance from an integer. Rounding causes a relative error of 1e-10.
 STEP = 1e-6
 
 
 class UnknownCreases:
-    """A cage some of whose creases have a sharpness that is not known yet.
+    """A cage with creases of unknown sharpness.
 
-    Derivatives at integers are those of the interval above, at ``highest`` of the one below. Where creases of unequal
-    sharpness meet, points may jump at integers: a vertex takes the mean sharpness of creases that become smooth there.
-    Raises CageError for an edge that is not between two faces, and those of `ControlCage.refinement`.
+    Derivatives at integers are those of the interval above, at ``highest`` of the interval below. Where creases of
+    unequal sharpness meet, points may jump at integers, as a vertex uses the mean sharpness of creases that become
+    smooth. Raises CageError for an edge without two faces, and the errors of `ControlCage.refinement`.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class UnknownCreases:
         cage: ControlCage,  # Its other tags stay
         edges: ArrayLike,  # (n_e, 2) int: 0-based ends of edges between two faces
         crease_of: IntArray,  # (n_e,) int64: the crease of each edge; all edges of a crease have one sharpness
-        highest: int,  # The highest sharpness, 1 to 6. `refined` is the cage refined as many times.
+        highest: int,  # Highest sharpness, 1 to 6, and number of refinements of `refined`
         scheme: str | None,  # As for `LimitSurface`
     ) -> None:
         if highest not in range(1, MOST_REFINEMENTS + 1):
@@ -55,16 +55,16 @@ class UnknownCreases:
         self.highest, self.crease_of = int(highest), crease_of
         self._cage, self._chosen, self._half_edges = cage, scheme, np.stack([half_edges, t.twin[half_edges]])
         given = np.minimum(cage.tags.edges[half_edges], highest)
-        # (n_c,) float64: of each crease, the mean of its edges' sharpness in the cage, `highest` at most.
+        # (n_c,) float64: mean sharpness of each crease's edges in the cage, at most `highest`.
         self.initial: FloatArray = np.bincount(crease_of, given) / np.bincount(crease_of)
         self._scheme = adapted_scheme(self.with_sharpness(np.full(len(self.initial), highest)), scheme)
-        # Without semi-sharp creases, it has the limit surface, with the control points of `points`.
+        # Cage of the limit surface without semi-sharp creases; its control points are `points`.
         self.refined = self.with_sharpness(self.initial)
         for _ in range(self.highest):
             self.refined = self.refined.refined(scheme)
 
     def with_sharpness(self, sharpness: FloatArray, positions: FloatArray | None = None) -> ControlCage:
-        """The cage, not refined, whose creases have some sharpness."""
+        """The unrefined cage with this sharpness of creases."""
         edges = self._cage.tags.edges.copy()
         edges[self._half_edges] = sharpness[self.crease_of]
         tags = Sharpness(edges, self._cage.tags.vertices)
@@ -72,13 +72,13 @@ class UnknownCreases:
         return built(contents if positions is None else replace(contents, positions=positions))
 
     def matrix(self, sharpness: FloatArray) -> sparse.csr_array:
-        """Control points of `refined` as weights of those of the cage, ``(n, n_v)``; rows sum to one."""
+        """Weights of the cage's control points in those of `refined`, ``(n, n_v)``; rows sum to one."""
         cut = self.with_sharpness(sharpness).cut_mesh
         topology, matrix = cut.topology, sparse.eye_array(self._cage.vertex_count, format="csr")[cut.vertex]
         for _ in range(self.highest):
             refinement = self._scheme.refine(topology)
             topology, matrix = refinement.topology, refinement.stencils.matrix @ matrix
-        # Face corners have the same numbers in the refined cage and in the refined cut mesh; vertices may have others.
+        # Face corners have the same numbers in the refined cage and in the refined cut mesh, vertices may not.
         kept = np.arange(self.refined.vertex_count)
         kept[self.refined.face_vertices] = topology.face_vertices
         return matrix[kept]
@@ -91,9 +91,9 @@ class UnknownCreases:
         return [(self.matrix(end) @ positions - before) / (STEP * side) for end, side in zip(ends, ahead, strict=True)]
 
     def points(self, sharpness: dr.ArrayBase, positions: dr.ArrayBase) -> mi.Float:
-        """Control points of `refined`, flat x, y, z, differentiable by both; of the sharpness of each crease.
+        """Control points of `refined`, flat x, y, z, differentiable by both the sharpness and the positions.
 
-        Runs on the host: the cost of a cage is small beside that of a render.
+        Runs on the host, as its cost is small beside that of a render.
         """
         values = np.clip(np.array(dr.detach(sharpness), dtype=np.float64), 0, self.highest)
         points = rows(dr.detach(positions))
@@ -111,9 +111,9 @@ class UnknownCreases:
         return attached(upload(mi.Float, matrix @ points), (sharpness, positions), forward, backward)
 
     def after(self, refinement: CageRefinement) -> UnknownCreases:
-        """The same creases on a refinement of the cage: halves of edges, one less sharp, and at least 1 at most."""
+        """The creases after a refinement of the cage: halves of edges; ``highest`` decreases by one, down to 1."""
         finer = refinement.cage.topology
-        # The first of the refined faces' corners are at the ends of the old half-edges, in their order.
+        # First corners of refined faces are at the starts of the old half-edges, in their order.
         halves = finer.face_sizes[0] * self._half_edges.ravel()
         edges = np.stack([finer.face_vertices[halves], finer.face_vertices[finer.next[halves]]], axis=1)
         highest = max(self.highest - 1, 1)

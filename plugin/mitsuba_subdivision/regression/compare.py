@@ -25,7 +25,7 @@ class WorstPixel:
     # The pixel's values; those of the first batch if the paired tier chose it
     reference: tuple[float, ...]
     test: tuple[float, ...]
-    names: tuple[str, ...] = RGB  # R, G and B, and other channels that differ
+    names: tuple[str, ...] = RGB  # R, G, B and other differing channels
     surface: str | None = None  # First hit of the ray through the pixel, by the reference's probe, or else the test's
     # Normals in the reference and in the test, if the probe tier chose the pixel
     normals: tuple[tuple[float, ...], tuple[float, ...]] | None = None
@@ -57,7 +57,7 @@ class Comparison:
     def worst(self) -> WorstPixel | None:
         """The pixel of the first tier that fails, else of the first that warns, else where the images differ most.
 
-        None only if the images are equal in all that was compared.
+        None if the compared data are equal.
         """
         for status in (Status.FAIL, Status.WARN):
             for tier in self.tiers:
@@ -115,20 +115,20 @@ class Comparison:
 def compare(
     reference: Image,
     test: Image,
-    # Names in `TIERS`; by default `DEFAULT_TIERS`, and FLIP besides if no tier can compare the radiance
+    # Names in `TIERS`; by default `DEFAULT_TIERS`, and FLIP if none of these can compare the radiance
     tiers: Sequence[str] | None = None,
     tolerances: Tolerances | None = None,  # By default those stored with the reference
     suite_size: int = 1,  # Number of scenes that share the probability of a false alarm
-    # What channels mean that only one image has, in `MISSING`. A warning by default: a file that gains a layer shows
-    # the same picture, but nobody should take the layer for compared.
+    # Effect of channels of only one image, in `MISSING`. A warning by default: a new layer does not change the picture,
+    # but is not compared.
     missing: str = "warn",
 ) -> Comparison:
     """Compare a test with a reference.
 
-    An image with pixels that are not finite fails at once, and no tier runs. The tile tier also runs, and decides,
-    where the paired tier cannot: the samples are not the same, or pixels differ and so does the machine or the library.
-    Where the same samples give the same bits and the probe passes, the tile tier cannot fail.
-    Raises RegressionError for images that cannot be compared, and for tiers that are unknown or lack their channels.
+    An image with non-finite pixels fails at once, and no tier runs. The tile tier decides where the paired tier cannot:
+    if samples are not the same, or if pixels differ and so do the machine or libraries. If the same samples give the
+    same bits and the probe passes, the tile tier cannot fail. Raises RegressionError for images that cannot be
+    compared, and for tiers that are unknown or lack their channels.
     """
     for image in (reference, test):
         if image.metadata.get("denoised"):
@@ -167,12 +167,12 @@ def compare(
     return Comparison(reference, test, list(results.values()), limits, notes, numbers)
 
 
-# Status of a comparison where only one image has some channels.
+# Status of a comparison with channels of only one image.
 MISSING = {"ignore": Status.PASS, "warn": Status.WARN, "fail": Status.FAIL}
 
 
 def _missing(reference: Image, test: Image, meaning: str) -> TierResult | None:
-    """Channels that only one of the images has; None if there are none."""
+    """Channels of only one image; None if there are none."""
     if meaning not in MISSING:
         raise RegressionError(f'missing channels "{meaning}"; expected one of {", ".join(MISSING)}')
     lines, status = [], MISSING[meaning]
@@ -180,7 +180,7 @@ def _missing(reference: Image, test: Image, meaning: str) -> TierResult | None:
         only = [name for name in image.names if name not in other.names]
         lines += [f"only the {role} has {', '.join(only)}"] if only else []
     if lines and meaning == "warn" and "sampling" in reference.metadata and "channels" not in reference.metadata:
-        status = Status.PASS  # It stays as good as it was
+        status = Status.PASS  # Unchanged
         lines.append("the reference is of an older version, which stored R, G, B: make it again to compare all")
     return TierResult("channels", status, lines) if lines else None
 
@@ -193,7 +193,7 @@ def relmse(reference: NDArray[np.floating], test: NDArray[np.floating]) -> float
 def _decide(
     results: dict[str, TierResult], compared: Callable[[str], TierResult], chosen: Sequence[str] | None
 ) -> None:
-    """Let other tiers decide where one cannot, and where one proves that another's finding is chance."""
+    """Let other tiers decide for one that cannot, or whose finding they prove to be chance."""
     paired, is_replaced = results.get("paired"), False
     if paired and paired.status in (Status.SKIPPED, Status.WARN):
         tile = results["tile"] = results.get("tile") or compared("tile")
@@ -216,7 +216,7 @@ def _decide(
 
 
 def _relative_error(reference: Image, test: Image) -> tuple[str, dict[str, Any]]:
-    """The relative mean squared error, and how large noise alone would make it."""
+    """The relative mean squared error, and its expectation for noise alone."""
     seen = reference.seen_with(test)
     numbers = {"relmse": relmse(reference.rgb[seen], test.rgb[seen])}
     text = f"relMSE {numbers['relmse']:.3g}"

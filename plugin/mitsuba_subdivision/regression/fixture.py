@@ -27,11 +27,11 @@ from .report import write_report
 from .scene import BOX, SceneSource, load_scene
 from .tiers import Status, Tolerances
 
-# Scenes that claim a reference, by its path: the scene in words, and the test that renders it.
+# Scenes of a reference, by its path: text of the scene, and the test that renders it.
 CLAIMS = pytest.StashKey[dict[Path, tuple[str, str]]]()
 TOO_LATE = "mitsuba was imported before mitsuba_subdivision, which would have found it an LLVM library;"
 NAME = "expected another name=.. for one of them"
-_Settings = tuple[dict[str, str], int]  # Parameters of the scene's file, and which of its sensors renders
+_Settings = tuple[dict[str, str], int]  # Parameters of the scene's file, and index of its sensor
 
 
 class RenderRegression:
@@ -66,20 +66,20 @@ class RenderRegression:
         """Render a scene, and fail the pytest test if the render differs from the scene's reference.
 
         Undecided comparisons are warnings of pytest, and properties of the test in JUnit files. Returns None if the
-        reference was written instead of compared with.
+        reference was written.
 
         Parameters
         ----------
         scene : path of an XML file, dictionary, or mi.Scene
-            A path is relative to the test's file, or else to pytest's root folder. The reconstruction filter is
-            replaced by "box"; a mi.Scene must already have that filter.
+            A path is relative to the test's file, or else to pytest's root folder. "box" replaces the reconstruction
+            filter; a mi.Scene must already have it.
         name : str, optional
             Name of the reference; by default the path of the scene's file relative to pytest's root folder, with the
             parameters and the sensor. A scene that is not a file needs a name.
         parameters : dict, optional
             Values for parameters of the scene file.
         sensor : int, optional
-            Which of the scene's sensors renders, from 0 on; the first if not given, with a warning if it has several.
+            Index of the scene's sensor; by default the first, with a warning if there are several.
         variant : str, optional
             Variant of Mitsuba; by default the reference's.
         spp, reference_spp, batch : int
@@ -87,11 +87,11 @@ class RenderRegression:
         tiers : sequence of str, optional
             Some of "probe", "paired", "tile" and "flip"; by default the first three.
         tolerances : dict, optional
-            Fields of `Tolerances` to use instead of those stored with the reference. A new reference stores them.
+            Fields of `Tolerances` that replace those of the reference. A new reference stores them.
         missing_channels : str
-            Effect of channels that only one of the images has: "ignore", "warn" or "fail".
+            Effect of channels of only one image: "ignore", "warn" or "fail".
         seed : int
-            From 0 on: each has other samples for the tile tier.
+            From 0 on: selects the samples of the tile tier.
         """
         __tracebackhide__ = True
         given = {key: str(value) for key, value in (parameters or {}).items()}
@@ -113,7 +113,7 @@ class RenderRegression:
             reference = renders.load_reference(path)
             _require_same_scene(reference, path, scene, settings)
             limits = Tolerances().with_values({**reference.metadata.get("tolerances", {}), **(tolerances or {})})
-            # All scenes with a reference share the probability of a false alarm, whichever tests are run.
+            # All scenes with a reference share the probability of a false alarm, in any selection of tests.
             suite_size = max(1, len(list(self.references.rglob("*.exr"))))
             count = max(1, round(spp * self.spp_scale))
             with variant_set(chosen_variant(variant) if variant else renders.variant_for(reference)):
@@ -134,7 +134,7 @@ class RenderRegression:
                     write()
                     failure = f"{problem}; wrote it; look at it, and run the test again"
         except (RuntimeError, OSError, ContentElsewhere) as problem:
-            # Mitsuba's place in a scene says more than the place in its code.
+            # The place in the scene helps more than the place in Mitsuba's code.
             failure = re.sub(r"^\[\S+:\d+\] ", "", str(problem))
         if failure:
             pytest.fail(failure, False)
@@ -168,7 +168,7 @@ class RenderRegression:
         relative = Path(os.path.relpath(scene, self.node.config.rootpath)).parent
         folder = self.references.joinpath(*(part for part in relative.parts if part not in ("..", os.sep)))
         path, old = folder / f"{scene.stem}{_suffix(settings)}.exr", self.references / f"{scene.stem}.exr"
-        # Older versions named references after the scene's file only.
+        # Older versions named references by the scene's file only.
         if not path.exists() and old.is_file():
             with suppress(RegressionError):
                 made_of = load_image(old).metadata
@@ -177,7 +177,7 @@ class RenderRegression:
         return path
 
     def _claim(self, path: Path, scene: SceneSource, settings: _Settings) -> None:
-        """Fail if another scene of this run has the same reference; tell pytest's summary which one this is."""
+        """Fail if another scene of this run has the same reference; record this one for pytest's summary."""
         words = f"{scene if isinstance(scene, Path) else 'a scene in memory'}{_suffix(settings)}"
         claims = self.node.config.stash.setdefault(CLAIMS, {})
         other, test = claims.setdefault(path, (words, self.node.nodeid))
@@ -214,7 +214,7 @@ def _settings_of(metadata: dict[str, Any]) -> _Settings:
 
 
 def _suffix(settings: _Settings) -> str:
-    """The settings as part of a name, or their checksum where a file cannot have that name."""
+    """The settings as part of a name, or their checksum if they are no valid file name."""
     values = {**settings[0], **({"sensor": str(settings[1])} if settings[1] else {})}
     text = "".join(f"-{key}={value}" for key, value in sorted(values.items()))
     if re.fullmatch(r"[\w.,=+-]{0,80}", text):
@@ -223,13 +223,13 @@ def _suffix(settings: _Settings) -> str:
 
 
 def _scene_of(metadata: dict[str, Any], path: Path) -> Path | None:
-    """The scene's file that a reference was made of, if it is known and still there."""
+    """The scene's file of a reference, if it is known and exists."""
     scene = (path.parent / metadata["scene"]).resolve() if "scene" in metadata else None
     return scene if scene is not None and scene.is_file() else None
 
 
 def _require_same_scene(reference: Image, path: Path, scene: SceneSource, settings: _Settings) -> None:
-    """Fail if a reference is of another scene; raise UnusableReference if it is of other parameters."""
+    """Fail if a reference shows another scene; raise UnusableReference if it has other parameters."""
     other = _scene_of(reference.metadata, path)
     if other and isinstance(scene, Path) and other != scene.resolve():
         pytest.fail(f'"{path}" is the reference of "{other}", this test renders "{scene.resolve()}"; {NAME}', False)

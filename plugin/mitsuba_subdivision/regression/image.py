@@ -1,4 +1,4 @@
-"""Images: Monte Carlo estimates of pixels, what else their files hold, and OpenEXR files of one part."""
+"""Images: Monte Carlo estimates of pixels, probes and metadata, and OpenEXR files of one part."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from . import ContentElsewhere, RegressionError
 
 SCHEMA = 1
 METADATA_ATTRIBUTE = "mitsuba_subdivision:metadata"
-NOTHING = 2**32 - 1  # Index that stands for no shape, no triangle or no element
+NOTHING = 2**32 - 1  # Index of no shape, triangle or element
 
 Channels = dict[str, NDArray]
 
 RGB = ("R", "G", "B")
-# Channels of the fields of a probe; those of one channel are indices. Before them comes `_OF_PROBE`, which files of
-# older versions lack: there, AOVs of these names would be taken for a probe.
+# Channels of a probe's fields; those of one channel are indices. They begin with `_OF_PROBE`, except in files of older
+# versions.
 _OF_PROBE = "probe_"
 _PROBE = {"position": ("P.X", "P.Y", "P.Z"), "normal": ("Ns.X", "Ns.Y", "Ns.Z"), "uv": ("uv.U", "uv.V")}
 _PROBE |= {"shape": ("shape",), "triangle": ("prim",), "element": ("element",)}
-# Pixels of the display window outside the data window are empty: of these channels, that is not 0.
+# Channels whose empty pixels, in the display window outside the data window, are not 0.
 _EMPTY = {"N": 1, **{f"{prefix}{name}": NOTHING for prefix in ("", _OF_PROBE) for name in ("shape", "prim", "element")}}
 _GIT_LFS = b"version https://git-lfs"
 _MAGIC = b"\x76\x2f\x31\x01"
@@ -39,7 +39,7 @@ _quieting = threading.Lock()
 
 
 def without_sample_counts(sampler: str) -> str:
-    """The description of a sampler without its numbers of samples, which renders change."""
+    """The description of a sampler without its numbers of samples."""
     return re.sub(r"\s*\b(sample_count|samples_per_wavefront|wavefront_size) = \d+", "", sampler)
 
 
@@ -47,8 +47,8 @@ def without_sample_counts(sampler: str) -> str:
 class Estimate:
     """Pixels estimated from batches of samples.
 
-    The variance of a sample is the variance of the batches' means, times the samples in a batch. That stays right where
-    the samples of a batch depend on each other, as with stratified samplers.
+    The variance of a sample is the variance of the batches' means times the samples in a batch, also if samples of a
+    batch depend on each other, as with stratified samplers.
     """
 
     mean: NDArray[np.float64]  # (height, width, channels)
@@ -72,7 +72,7 @@ class Estimate:
 def combine(estimates: Iterable[Estimate]) -> Estimate:
     """Combine estimates with independent samples; in the same order, the same estimates give the same bits.
 
-    The sums of squares are updated pairwise [Chan et al. 1979], without the cancellation of ``E[x^2] - E[x]^2``.
+    Sums of squares are combined pairwise [Chan et al. 1979], without the cancellation of ``E[x^2] - E[x]^2``.
     """
     rest = iter(estimates)
     if (total := next(rest, None)) is None:
@@ -96,14 +96,14 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
 
 @dataclass(frozen=True, eq=False)
 class Probe:
-    """The geometry probe: AOVs of the first hits of the rays through pixel centres, which have no noise."""
+    """The geometry probe: noise-free AOVs of the first hits of rays through pixel centres."""
 
-    # (height, width, 3) each, in world space, and unit shading normals. Zero where the ray hits nothing.
+    # (height, width, 3) each, in world space, with unit shading normals. Zero without a hit.
     position: NDArray[np.float32]
     normal: NDArray[np.float32]
-    # (height, width, 2): parameters by the renderer; for a mesh without texture coordinates, those of the triangle
+    # (height, width, 2): the renderer's parameters; for a mesh without texture coordinates, those of the triangle
     uv: NDArray[np.float32]
-    # (height, width) each: indices of the shape, of the triangle, and of its face of the cage; `NOTHING` for none
+    # (height, width) each: indices of the shape, the triangle, and its face of the cage; `NOTHING` for none
     shape: NDArray[np.uint32]
     triangle: NDArray[np.uint32]
     element: NDArray[np.uint32]
@@ -120,7 +120,7 @@ class Probe:
         }
 
     def describe(self, y: int, x: int, shapes: Sequence[str] = ()) -> str:
-        """Text of the first hit of the ray through a pixel, by the ids of the scene's shapes, if these are known."""
+        """Text of the first hit in a pixel, with the shape's id if it is known."""
         shape = int(self.shape[y, x])
         if shape == NOTHING:
             return "its ray hits nothing"
@@ -134,15 +134,15 @@ class Probe:
 class Image:
     """A linear image, and the further data of its file."""
 
-    name: str  # For messages: the path of the file, in most cases
+    name: str  # For messages: usually the path of the file
     pixels: NDArray[np.float64]  # (height, width, channels), of the display window; R, G and B come first
     estimate: Estimate | None = None  # Variance and number of samples; its mean is `pixels`
-    # As `pixels`: the first batch alone, whose samples a later render of the same scene repeats one by one
+    # As `pixels`: the first batch alone, whose samples a later render of the scene repeats
     paired: NDArray[np.float64] | None = None
     probe: Probe | None = None
     metadata: dict[str, Any] = field(default_factory=dict)  # How the image was made
     names: tuple[str, ...] = RGB  # Channels
-    # First column and row of the display window of a file, and which of its pixels have data; None for all.
+    # First column and row of a file's display window, and a mask of its pixels with data; None for all.
     origin: tuple[int, int] = (0, 0)
     has_data: NDArray[np.bool_] | None = None
 
@@ -152,7 +152,7 @@ class Image:
         return self.pixels.shape[1], self.pixels.shape[0]
 
     def seen_with(self, other: Image) -> NDArray[np.bool_]:
-        """Pixels where one of two images has data; all if none has, as where one was made without a file."""
+        """Pixels with data in one of two images; all pixels if there are none."""
         if self.has_data is None or other.has_data is None or not (self.has_data | other.has_data).any():
             return np.ones(self.pixels.shape[:2], dtype=bool)
         return self.has_data | other.has_data
@@ -177,7 +177,7 @@ class Image:
         return channels | (self.probe.channels() if self.probe is not None else {})
 
     def not_finite(self) -> tuple[str, tuple[int, int]] | None:
-        """Values that are not finite, in words, and row and column of the first; None if there are none."""
+        """Text about non-finite values, and row and column of the first; None if there are none."""
         broken = {name: values for name, values in self.channels().items() if not np.isfinite(values).all()}
         if not broken:
             return None
@@ -190,20 +190,20 @@ class Image:
 
 
 def require_finite(image: Image) -> None:
-    """Raise RegressionError if an image is not finite: merging would spread that, and no tier can compare it."""
+    """Raise RegressionError if an image is not finite: merging would spread such pixels, and no tier compares them."""
     if broken := image.not_finite():
         raise RegressionError(f'image "{image.name}" is not finite: {broken[0]}')
 
 
 def save_image(path: str | Path, image: Image) -> None:
-    """Write an image. The same image gives the same bytes, and the file appears whole or not at all."""
+    """Write an image to a complete file. The same image gives the same bytes."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_channels(path, image.channels(), {"schema": SCHEMA, **image.metadata})
 
 
 def load_image(path: str | Path) -> Image:
-    """Read an image: any OpenEXR file with R, G and B, or one written by `save_image`; else raise RegressionError."""
+    """Read an OpenEXR file with R, G and B; raise RegressionError for any other file."""
     channels, metadata, origin, has_data = _read(path)
     source = str(path)
     if (schema := metadata.get("schema", SCHEMA)) != SCHEMA:
@@ -232,13 +232,13 @@ def _estimate(channels: Channels, layers: Channels, metadata: dict[str, Any], so
     if variance.min() < 0:
         raise RegressionError(f'image "{source}" has a variance of {variance.min():g}; expected at least 0')
     ranges = metadata.get("sampling", {}).get("batches")
-    # A file of another program records no batches: each sample then counts as a batch.
+    # Files of other programs record no batches: each sample counts as a batch.
     batches = sum(end - start for start, end in ranges) if ranges else int(count.max())
     return Estimate(layers[""], variance, count, batches)
 
 
 def _probe(channels: Channels, source: str) -> tuple[Probe | None, set[str]]:
-    """The probe, and the names of its channels. Those without a prefix are AOVs unless all are there."""
+    """The probe, and the names of its channels. Names without the prefix are AOVs unless they are complete."""
     plain = {channel for names in _PROBE.values() for channel in names}
     prefix = "" if plain <= channels.keys() else _OF_PROBE
     expected = {f"{prefix}{channel}" for channel in plain}
@@ -264,7 +264,7 @@ def _stacked(channels: Channels, prefix: str, names: Sequence[str], source: str)
 
 
 def _require_metadata(metadata: dict[str, Any], source: str) -> None:
-    """Refuse metadata of another form than `save_image` writes. Any entry may be missing."""
+    """Refuse metadata in another form than that of `save_image`. Any entry may be missing."""
 
     def has_integers(value: Any, **least: int) -> bool:
         return isinstance(value, dict) and all(type(value.get(k)) is int and value[k] >= n for k, n in least.items())
@@ -277,7 +277,7 @@ def _require_metadata(metadata: dict[str, Any], source: str) -> None:
             return False
         if not ends or not is_sorted or any(type(end) is not int for end in ends):
             return False
-        counts = {"total": ends[-1], "passes": 1, **value}  # Files of older versions have neither of these
+        counts = {"total": ends[-1], "passes": 1, **value}  # Missing in files of older versions
         return has_integers(counts, seed=0, batch=1, total=ends[-1], passes=1) and counts["passes"] <= counts["total"]
 
     forms: dict[str, tuple[Callable[[Any], bool], str]] = {
@@ -307,10 +307,10 @@ def write_exr(path: str | Path, pixels: NDArray[np.floating], metadata: dict | N
 
 
 def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: dict | None = None) -> None:
-    """Write named channels into a file of one part, as Mitsuba reads only the first; it appears whole or not at all.
+    """Write named channels to a complete file of one part, as Mitsuba reads only the first part.
 
-    The same channels and metadata give the same bytes. Integers become 32 bits unsigned, all else float32; a dot in a
-    name makes a layer: ``variance.R``. Metadata are JSON, in the string attribute `METADATA_ATTRIBUTE`.
+    The same channels and metadata give the same bytes. Integers become 32 bits unsigned, other types float32; a dot in
+    a name separates a layer: ``variance.R``. Metadata are JSON in the string attribute `METADATA_ATTRIBUTE`.
     """
     kinds = {name: np.uint32 if values.dtype.kind in "iu" else np.float32 for name, values in channels.items()}
     converted = {name: np.ascontiguousarray(values, dtype=kinds[name]) for name, values in channels.items()}
@@ -325,21 +325,21 @@ def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: 
 def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
     """Channels ``(height, width)`` by name of a file of one part, and its metadata, empty if there is none.
 
-    They show the display window, and are empty outside the data window: 0, and no shape. Raises RegressionError if the
-    file cannot be read, or has several parts, deep pixels or broken metadata.
+    Channels cover the display window, and are empty outside the data window: 0, and no shape. Raises RegressionError if
+    the file cannot be read, or has several parts, deep pixels or broken metadata.
     """
     return _read(path)[:2]
 
 
 def _read(path: str | Path) -> tuple[Channels, dict[str, Any], tuple[int, int], NDArray[np.bool_]]:
-    """`read_channels`, the first column and row of the display window, and which of its pixels have data."""
+    """Result of `read_channels`, first column and row of the display window, and a mask of its pixels with data."""
     path = Path(path)
     if not path.is_file():
         raise RegressionError(f'image "{path}" is not a file; expected an OpenEXR file')
     try:
         with _quiet(), OpenEXR.File(str(path), separate_channels=True) as file:
             parts = len(file.parts)
-            header = dict(file.header()) if parts == 1 else {}  # A file whose pixels cannot be read has none
+            header = dict(file.header()) if parts == 1 else {}  # Missing in a file with unreadable pixels
             channels = {n: np.array(c.pixels) for n, c in file.channels().items()} if parts == 1 else {}
     except (RuntimeError, ValueError, OSError):
         parts = 0
@@ -362,7 +362,7 @@ def _read(path: str | Path) -> tuple[Channels, dict[str, Any], tuple[int, int], 
         raise RegressionError(f'attribute "{METADATA_ATTRIBUTE}" of image "{path}" is no JSON object')
     (start, stop), (first, last) = (np.asarray(header[name]) for name in ("displayWindow", "dataWindow"))
     has_data = np.zeros((stop - start + 1)[::-1], dtype=bool)
-    # Columns and rows that both windows have, in each of them.
+    # Common columns and rows of both windows, in each of them.
     low, high = np.maximum(start, first), np.maximum(np.minimum(stop, last) + 1, np.maximum(start, first))
     of_display, of_data = (tuple(map(slice, (low - at)[::-1], (high - at)[::-1])) for at in (start, first))
     has_data[of_display] = True
@@ -375,9 +375,9 @@ def _read(path: str | Path) -> tuple[Channels, dict[str, Any], tuple[int, int], 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Close standard output and error while OpenEXR reads: it reports each row of a damaged file there."""
+    """Close standard output and error while OpenEXR reads: it prints each row of a damaged file."""
     with _quieting, open(os.devnull, "w") as nothing, redirect_stdout(nothing), ExitStack() as stack:
-        with suppress(OSError):  # Where standard error is closed
+        with suppress(OSError):  # If standard error is closed
             kept = os.dup(2)
             stack.callback(os.close, kept)
             stack.callback(os.dup2, kept, 2)

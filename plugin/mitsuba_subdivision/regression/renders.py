@@ -1,4 +1,4 @@
-"""Renders of scenes: by passes; references, converged renders; and comparisons with these.
+"""Renders of scenes by passes, references (converged renders), and comparisons with references.
 
 A pass renders a share of an image's batches; passes are merged into the image.
 """
@@ -28,7 +28,7 @@ from .scene import SEEDS, LoadedScene, SceneSource, load_scene, render_pixels
 from .tiers import Status, Tolerances
 
 BATCH = 64  # Samples per pixel of a batch
-# Fewer batches than these measure the variance badly.
+# Fewer batches estimate the variance badly.
 LEAST_BATCHES = 4
 _OF_SAMPLING = ("seed", "batch", "total")
 # Entries of the metadata that all passes of an image share.
@@ -37,7 +37,7 @@ _SHARED = ("variant", "filter", "sampler", "sensor", "size", "channels", "files"
 
 @dataclass(frozen=True)
 class Sampling:
-    """Which samples make an image: batches of ``batch`` samples per pixel; batch b has the seed ``seed + b``."""
+    """The samples of an image: batches of ``batch`` samples per pixel; batch b has the seed ``seed + b``."""
 
     batches: int
     batch: int = BATCH
@@ -45,7 +45,7 @@ class Sampling:
 
     @classmethod
     def of_spp(cls, spp: int, batch: int = BATCH, seed: int = 0) -> Sampling:
-        """At least ``spp`` samples in whole batches, at least `LEAST_BATCHES`."""
+        """At least ``spp`` samples in at least `LEAST_BATCHES` whole batches."""
         batch = min(batch, max(1, spp // LEAST_BATCHES))
         return cls(max(LEAST_BATCHES, -(-spp // batch)), batch, seed)
 
@@ -66,7 +66,7 @@ class Sampling:
 def render_pass(
     loaded: LoadedScene, sampling: Sampling, number: int = 1, count: int = 1, *, with_probe: bool = False
 ) -> Image:
-    """Render the batches of one pass; the first also with the first batch alone and the probe, if ``with_probe``."""
+    """Render the batches of one pass; ``with_probe`` adds the first batch alone and the probe to the first pass."""
     share = sampling.share(number, count)
     first: NDArray[np.float32] | None = None
     names: list[str] = []
@@ -80,13 +80,13 @@ def render_pass(
             if (film := pixels.shape)[2:] < (3,):
                 raise RegressionError(f'the film has the shape {film}; expected R, G, B: pixel_format "rgb" or "rgba"')
             every = loaded.channel_names(pixels.shape[2])
-            # Indices have no mean, and those of shapes depend on what else is loaded: the probe compares them.
+            # Indices have no mean, and shapes' indices depend on other loaded objects; the probe compares them.
             kept = [i for i, name in enumerate(every) if not name.endswith(".I")]
             names, pixels = [every[i] for i in kept], pixels[..., kept]
             first = pixels if first is None else first
             yield Estimate.of_batch(pixels, sampling.batch)
 
-    # Rounded as in a file, so that it does not matter whether a pass was written and read again.
+    # Rounded as in a file, so that a pass is the same after writing and reading.
     with timed("Rendering") as at:
         estimate = combine(batches()).stored()
     record = {"seed": sampling.seed, "batch": sampling.batch, "batches": [[share.start, share.stop]]}
@@ -115,7 +115,7 @@ def render_pass(
 
 
 def merge_passes(passes: Sequence[Image], name: str = "merged") -> Image:
-    """Merge passes of one image. The order in which they are given makes no difference."""
+    """Merge passes of one image, in any order."""
     if not passes:
         raise RegressionError("no passes to merge; expected at least one")
     for image in passes:
@@ -132,7 +132,7 @@ def merge_passes(passes: Sequence[Image], name: str = "merged") -> Image:
 
 
 def missing_passes(image: Image) -> list[int]:
-    """Numbers of the passes that a merged image lacks, whole or in part."""
+    """Numbers of incomplete passes of a merged image."""
     record = image.metadata["sampling"]
     present = {index for start, stop in record["batches"] for index in range(start, stop)}
     total, passes = record.get("total", max(present) + 1), record.get("passes", 1)
@@ -149,7 +149,7 @@ def _require_same_image(first: Image, other: Image) -> None:
             if isinstance(a, dict) and isinstance(b, dict):
                 names = sorted(name for name in {*a, *b} if a.get(name) != b.get(name))
                 values = ", ".join(f"{name} is {a.get(name)} and {b.get(name)}" for name in names)
-                # Nobody reads checksums.
+                # Checksums do not help in messages.
                 difference = f"of the {key}, {', '.join(names)} differ" if key == "files" else values
             raise RegressionError(f'"{first.name}" and "{other.name}" are not passes of one image: {difference}')
 
@@ -170,18 +170,18 @@ def _joined(ordered: Sequence[Image]) -> list[list[int]]:
 def probe_scene(loaded: LoadedScene) -> Probe:
     """The first hits of the rays through the centres of pixels."""
     width, height = loaded.size
-    # Any, as the stubs are those of variants with arrays.
+    # Any, as the stubs are for variants with arrays.
     sensor: Any = loaded.sensor
     scene: Any = loaded.scene
 
     def first_hit(x: Any, y: Any) -> Any:
         film_position = mi.Point2f((x + 0.5) / width, (y + 0.5) / height)
-        # The middle of the lens and of the spectrum, when the shutter opens: a probe takes no random samples.
+        # Middle of the lens and the spectrum, and opening of the shutter: a probe has no random samples.
         ray, _ = sensor.sample_ray(sensor.shutter_open(), 0.5, film_position, mi.Point2f(0.5))
         return scene.ray_intersect(ray)
 
     shapes = scene.shapes()
-    # One hit of arrays; in scalar variants, one for each pixel.
+    # One hit with arrays; in scalar variants, one for each pixel.
     if dr.is_jit_v(mi.Float):
         pixel = dr.arange(mi.UInt32, width * height)
         hits = [first_hit(mi.Float(pixel % width), mi.Float(pixel // width))]
@@ -211,14 +211,13 @@ def probe_scene(loaded: LoadedScene) -> Probe:
 # Samples per pixel: four batches for a test, and 64 times as many for a reference.
 TEST_SPP = 256
 REFERENCE_SPP = 16384
-# The seeds of a test are this far from the reference's, so that the samples differ; those of other tests and of second
-# attempts are as far from each other.
+# Distance between the seeds of references, tests and second attempts, whose samples differ.
 SEED_STEP = 2**20
-RETRY_FACTOR = 4  # Samples of the second attempt, in samples of the first
+RETRY_FACTOR = 4  # Samples of the second attempt, relative to the first
 
 
 def as_reference(image: Image, scene: Path | None, path: str | Path, tolerances: Tolerances) -> Image:
-    """Add tolerances to a finite image, and the command that renders the scene's file to the reference's path again."""
+    """Add tolerances to a finite image, and the command that renders the reference again."""
     require_finite(image)
     limits, made_by = tolerances.as_dict(), image.metadata
     metadata, sampling = {**made_by, "tolerances": limits}, made_by["sampling"]
@@ -236,7 +235,7 @@ def as_reference(image: Image, scene: Path | None, path: str | Path, tolerances:
 
 
 class UnusableReference(RegressionError):
-    """A reference is missing, cannot be read, or is of another scene: it has to be made again."""
+    """A reference is missing, unreadable, or of another scene, and must be rendered again."""
 
 
 def load_reference(path: Path) -> Image:
@@ -266,7 +265,7 @@ def _assignments(option: str, values: Mapping[str, object]) -> list[str]:
 
 
 def variant_for(reference: Image) -> str:
-    """Variant of the reference, or the best that runs here if that one does not."""
+    """Variant of the reference, or the best available one."""
     wanted = reference.metadata.get("variant", "")
     return best_variant() if variant_problem(wanted) else wanted
 
@@ -274,9 +273,9 @@ def variant_for(reference: Image) -> str:
 def render_like(
     reference: Image, source: SceneSource, spp: int = TEST_SPP, seed: int = 0, *, second_attempt: bool = False
 ) -> Image:
-    """Render a scene in the current variant with the settings of a reference, and with other samples for each seed.
+    """Render a scene in the current variant with the settings of a reference, but other samples for each seed.
 
-    The first attempt also has the probe, and for the paired tier the samples of the reference's first batch.
+    The first attempt also has the probe, and the samples of the reference's first batch for the paired tier.
     """
     sampling = sampling_of(reference)
     loaded = _load_like(reference, source)
@@ -310,9 +309,9 @@ def compare_scene(
 ) -> Comparison:
     """Render a scene as its reference was, in the current variant, and `compare` the two.
 
-    Where only the tile tier fails, chance may be the reason. A second attempt with new samples, four times as many,
-    then decides. Where the paired tier warns, as on another machine, and still no tier fails, the tile tier decides by
-    all samples of the reference, which leave nearly no noise: it sees what the paired tier would have seen.
+    If only the tile tier fails, a second attempt with four times as many new samples decides. If the paired tier warns,
+    as on another machine, and still no tier fails, the tile tier decides with all samples of the reference, so that
+    nearly all noise is the same in both.
     """
     test = render_like(reference, source, spp, seed)
 

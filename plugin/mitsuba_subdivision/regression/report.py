@@ -28,8 +28,8 @@ MOST_OTHERS = 4  # Panels of channels besides R, G and B
 COLUMNS, PANEL_INCHES, DOTS_PER_INCH = 4, 2.9, 160
 ANGLES = (1e-5, 10.0)  # Degrees of the first and of the last colour
 _SIGNED = "RdBu_r"
-# Title, caption and colours of each map; what the colours reach at least, so that rounding stays pale; and the
-# percentile that they reach.
+# Title, caption and colours of each map; least range of the colours, so that rounding stays pale; percentile at their
+# end.
 _MAPS = {
     "relative": ("Relative difference", "(test - reference) / reference,\nmean of R, G, B", _SIGNED, 0.01, 99.0),
     "paired": ("Paired difference", "from the same samples, so\nwithout noise", _SIGNED, 0.01, 99.0),
@@ -41,9 +41,9 @@ _MAPS = {
 
 
 def write_report(folder: str | Path, comparison: Comparison, title: str | None = None) -> Path:
-    """Write the report of a comparison, and return the path of its page, which needs no other file.
+    """Write the report of a comparison, and return the path of its self-contained page.
 
-    The title is by default the reference's name. Raises RegressionError if matplotlib is not installed.
+    The default title is the reference's name. Raises RegressionError if matplotlib is not installed.
     """
     folder = Path(folder)
     title = title or comparison.reference.name
@@ -75,7 +75,7 @@ def write_index(folder: str | Path) -> Path | None:
 
 
 def srgb(pixels: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Codes of sRGB from 0 to 1 of linear RGB; magenta where a pixel is not finite."""
+    """Linear RGB as sRGB codes from 0 to 1; non-finite pixels are magenta."""
     finite = np.isfinite(pixels).all(axis=-1, keepdims=True)
     return np.where(finite, encoded(np.clip(np.nan_to_num(pixels, posinf=0, neginf=0), 0, 1)), (1.0, 0.0, 1.0))
 
@@ -109,26 +109,26 @@ def _panels(comparison: Comparison) -> bytes:
 
 
 def _maps(comparison: Comparison) -> dict[str, NDArray[np.floating]]:
-    """The maps of all tiers, with that of FLIP for inspection where its tier did not run but can."""
+    """The maps of all tiers, and if possible FLIP's for inspection."""
     maps = comparison.maps
     if "flip" not in maps:
         with suppress(RegressionError):
             maps |= compare_flip(comparison.reference, comparison.test, comparison.tolerances).maps
     reference, test = comparison.reference, comparison.test
     others = {name: test.pixels[..., i] - reference.pixels[..., i] for i, name in enumerate(reference.names) if i > 2}
-    # Alpha, and the channels that differ most.
+    # Alpha, and the most different channels.
     order = sorted(others, key=lambda name: (name != "A", -np.abs(others[name]).mean()))
     return maps | {f"difference of {name}": others[name] for name in order[:MOST_OTHERS]}
 
 
 def _draw_map(panel: Axes, comparison: Comparison, name: str, values: NDArray[np.floating]) -> None:
-    """Draw a map with the meaning of its colours, grey where it has no value."""
+    """Draw a map with its colour bar, grey where it has no value."""
     import matplotlib
     from matplotlib.colors import LogNorm, Normalize
     from matplotlib.patches import Rectangle
     from matplotlib.ticker import MaxNLocator
 
-    # Alpha, layers and AOVs are in units of their own.
+    # Alpha, layers and AOVs have their own units.
     other = (name[:1].upper() + name[1:], "test - reference", _SIGNED, 1e-6, 99.9)
     title, caption, colours, least, percentile = _MAPS.get(name, other)
     if name == "angle":

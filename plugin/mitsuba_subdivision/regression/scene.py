@@ -1,4 +1,4 @@
-"""Scenes of the current variant of Mitsuba: loading, rendering in one process, and what their last bits depend on."""
+"""Scenes of the current variant of Mitsuba: loading, rendering in one process, reproducible bits."""
 
 from __future__ import annotations
 
@@ -20,11 +20,10 @@ from .image import without_sample_counts
 
 BOX = "box"
 
-# Path of an XML file, dictionary, or mi.Scene.
-# As text, since Mitsuba has no classes before a variant is set.
+# Path of an XML file, dictionary, or mi.Scene. As text, as Mitsuba has no classes before a variant is set.
 SceneSource = Union[str, Path, Mapping[str, Any], "mi.Scene"]
-# Samples of a part, and its fewest samples per pixel: with fewer, the weights of a wide reconstruction filter would
-# differ too much from part to part.
+# Samples of a part, and least samples per pixel: with fewer, weights of a wide reconstruction filter would differ
+# between parts.
 PART_SAMPLES = 1 << 22
 LEAST_PART_SPP = 16
 SEEDS = 2**32  # Seeds of Mitsuba have 32 bits
@@ -37,7 +36,7 @@ class LoadedScene:
     scene: mi.Scene
     path: Path | None  # The scene's file; None for a scene from a dictionary or from memory
     filter: str  # Name of the film's reconstruction filter
-    # SHA-256 checksums of the scene's file and of all files that the scene names, by paths from the scene's folder
+    # SHA-256 checksums of the scene's file and all its files, by paths from the scene's folder
     files: dict[str, str] = field(default_factory=dict)
     parameters: dict[str, str] = field(default_factory=dict)  # Given values of parameters of the scene's file
     sensor_index: int = 0
@@ -48,16 +47,16 @@ class LoadedScene:
 
     @property
     def sampler(self) -> str:
-        """Kind and options of the sampler, without its numbers of samples."""
+        """Type and options of the sampler, without its numbers of samples."""
         kind, *options = without_sample_counts(str(self.sensor.sampler())).replace("[", " ").splitlines()
         return " ".join([kind.strip(), *filter(None, (option.strip(" ,]") for option in options))])
 
     def channel_names(self, count: int) -> tuple[str, ...]:
-        """Names of as many channels as an image of the scene has: R, G, B, A and AOVs."""
+        """Names of the channels of an image of the scene: R, G, B, A and AOVs."""
         has_alpha = int(self.sensor.film().flags()) & int(mi.FilmFlags.Alpha)
         colours, others = ["R", "G", "B", "A"][: 4 if has_alpha else 3], list(self.scene.integrator().aov_names())
         nested = [name.removesuffix(".A") for name in others if name.endswith(".A")]
-        # Integrators within one of AOVs have channels of their own; those of the first are the film's.
+        # Integrators inside `aov` have channels, too; those of the first are the film's.
         if nested and len(colours) + len(others) != count:
             absent = {f"{nested[0]}.{name}" for name in "RGBA"} | {f"{name}.A" for name in nested if not has_alpha}
             others = [name for name in others if name not in absent]
@@ -84,7 +83,7 @@ def load_scene(
 ) -> LoadedScene:
     """Load a scene in the current variant, with values for parameters of its file, for one of its sensors.
 
-    The filter replaces the film's own. With "box", the same seed gives the same bits.
+    The filter replaces the film's. With "box", the same seed gives the same bits.
     """
     given = {name: str(value) for name, value in (parameters or {}).items()}
     source = Path(source) if isinstance(source, str) else source
@@ -102,7 +101,7 @@ def load_scene(
         sensors = "one sensor, 0" if count == 1 else f"sensors 0 to {count - 1}"
         raise RegressionError(f"there is no sensor {sensor_index}; the scene has {sensors}")
     film = scene.sensors()[sensor_index].film()
-    # The class that the filter prints, "BoxFilter[]", names "box".
+    # The filter prints "BoxFilter[]" for "box".
     filter_of_scene = str(film.rfilter()).partition("[")[0].removesuffix("Filter").lower()
     if isinstance(source, mi.Scene) and filter_name not in (None, filter_of_scene):
         expected = f'expected "{filter_name}", which a scene given as a file or a dictionary gets'
@@ -113,7 +112,7 @@ def load_scene(
 def _parsed_scene(
     source: Path | Mapping[str, Any], parameters: dict[str, str], filter_name: str | None
 ) -> tuple[Any, dict[str, str]]:
-    """A scene of a file or a dictionary, or what that holds instead; and checksums of the files that it names."""
+    """The object of a file or a dictionary, a scene or another one; and checksums of its files."""
     config = mi.parser.ParserConfig(str(mi.variant()))
     with kept_search_folders() as resolver:
         if isinstance(source, Mapping):
@@ -126,16 +125,15 @@ def _parsed_scene(
             files = _checksums(source, state) if isinstance(source, Path) else {}
             if filter_name:
                 _replace_filter(state, filter_name)
-            # Where meshes are merged, the order of the area lights depends on addresses in memory, and with the order
-            # the random numbers.
+            # If meshes are merged, addresses in memory decide the order of area lights, and so the random numbers.
             config.merge_meshes = False
-            # Loaded at once, shapes are numbered in any order, and with it the kernels of instances differ: they would
-            # be compiled again in some processes.
+            # Parallel loading numbers shapes in random order, which changes kernels of instances: some processes would
+            # compile them again.
             config.parallel = not any(node.props.plugin_name() == "instance" for node in state.nodes)
             mi.parser.transform_all(config, state)
             made = mi.parser.instantiate(config, state)
         finally:
-            # While a half-made scene is alive, in the traceback of an error, rendering another scene crashes.
+            # Rendering another scene crashes while the traceback of an error keeps a half-made scene alive.
             del state
     # A single object comes in a list.
     return (made[0] if isinstance(made, (list, tuple)) and len(made) == 1 else made), files
@@ -165,7 +163,7 @@ def _replace_filter(state: mi.parser.ParserState, name: str) -> None:
         node = mi.parser.SceneNode()
         node.type = mi.ObjectType.ReconstructionFilter
         node.props = mi.Properties(name)
-        # A new node makes the others move in memory, so the film's is looked up after that.
+        # A new node moves the others in memory, so the film is looked up afterwards.
         state.nodes.append(node)
         properties = state.nodes[film].props
         for key in list(properties.keys()):
@@ -196,7 +194,7 @@ def render_pixels(scene: mi.Scene, seed: int, spp: int, **options: Any) -> NDArr
 def render_parts(
     scene: mi.Scene, parts: Sequence[int], seed: int = 0, what: str = "Rendering", **options: Any
 ) -> NDArray[np.float32]:
-    """Mean of parts of an image, given by their samples per pixel, each weighted by these.
+    """Mean of parts of an image, weighted by their samples per pixel.
 
     Part i of n has the seed ``seed * n + i``, so that images of several seeds share no samples.
     """
@@ -210,13 +208,13 @@ def render_parts(
 
 
 def render_image(loaded: LoadedScene, spp: int, seed: int = 0) -> NDArray[np.float32]:
-    """Render with all channels: many samples in parts, where the sampler is "independent"; else by one `mi.render`."""
+    """Render with all channels: many samples in parts if the sampler is "independent"; else by one `mi.render`."""
     is_independent = str(loaded.sensor.sampler()).startswith("IndependentSampler")
     parts = parts_of(spp, loaded.size) if is_independent else [spp]
     return render_parts(loaded.scene, parts, seed, sensor=loaded.sensor_index)
 
 
 def parts_of(spp: int, size: tuple[int, int]) -> list[int]:
-    """Samples per pixel of the parts of an image of this width and height; they differ by one at most."""
+    """Samples per pixel of the parts of an image of this width and height; they differ by at most one."""
     count = max(1, spp // max(LEAST_PART_SPP, PART_SAMPLES // (size[0] * size[1])))
     return [(i + 1) * spp // count - i * spp // count for i in range(count)]

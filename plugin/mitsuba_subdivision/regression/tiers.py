@@ -1,6 +1,6 @@
 """The tiers of a comparison: their tolerances, results and tests.
 
-The tests compare geometry probes, the same samples, noise in tiles of several sizes, and what an eye sees.
+The tests compare geometry probes, pixels of the same samples, means of tiles relative to noise, and perception.
 """
 
 from __future__ import annotations
@@ -17,37 +17,37 @@ from numpy.typing import NDArray
 from . import RegressionError
 from .image import Estimate, Image, without_sample_counts
 
-# Names, and what each compares.
+# Names and descriptions.
 TIERS = {
     "probe": "what the rays through the centres of the pixels hit",
     "paired": "pixels from the same samples, which must be the same",
     "tile": "tiles of several sizes: does noise explain their difference?",
     "flip": "converged pixels, as an eye sees them",
 }
-# Noise makes FLIP's errors large. So this tier is left for images that no other tier can compare.
+# Noise increases FLIP's errors, so this tier is only for images that no other tier can compare.
 DEFAULT_TIERS = ("probe", "paired", "tile")
 
-# The difference of a pixel that is darker than this part of the image's mean is taken relative to that part.
+# Differences are relative to at least this part of the image's mean.
 DARK = 1e-3
-# Both images drew the same samples if these agree. References of older versions lack the last two.
+# Both images have the same samples if these agree. References of older versions lack the last two.
 _SAME_SAMPLES, _IF_KNOWN = ("variant", "filter", "paired"), ("sampler", "sensor")
 
-# Sides of the square tiles in pixels; None is the whole image. Small tiles find dents, large ones a change of colour.
+# Sides of the square tiles in pixels; None for the whole image. Small tiles find dents, large ones changes of colour.
 SCALES: tuple[int | None, ...] = (4, 8, 16, None)
-# Samples that a reference should have for each of the test's, so that its own noise hardly counts.
+# Recommended samples of a reference per sample of the test, for negligible noise.
 REFERENCE_SAMPLES = 16
-NOISE_TILE = 4  # Side of the tiles that measure how much noisier the test is than the reference
-# Mitsuba's spectra of a colour miss it by up to this part of its largest value; measured for 18 colours.
+NOISE_TILE = 4  # Side of the tiles for the ratio of the test's noise to the reference's
+# Error of Mitsuba's spectra of a colour, relative to its largest value; measured for 18 colours.
 SPECTRA = 5e-4
-# Part of the variance that images with all samples in common keep at least. If all noise of a pixel is that of a single
-# bright path, and rounding sends it elsewhere, then the difference is 1 / sqrt(0.1) = 3.2 standard errors.
+# Least part of the variance for images with all samples in common. If a single bright path makes all noise of a pixel,
+# and rounding changes this path, the difference is 1 / sqrt(0.1) = 3.2 standard errors.
 LEAST_NOISE = 0.1
 _MOST_FREEDOM = 1e12  # More degrees of freedom make no difference
 
-# What FLIP's tone curve, ACES, maps to 0.85, the value that limits its exposures; and weights of R, G and B.
+# Value that FLIP's tone curve, ACES, maps to 0.85, which limits its exposures; and weights of R, G and B.
 _BRIGHT = 2.118872324
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
-# Stops between the brightest and the median pixel at most: more would take time and show nothing new.
+# Most stops between the brightest and the median pixel: more take time and show nothing new.
 _MOST_STOPS = 12
 
 
@@ -66,22 +66,22 @@ class TierResult:
 
     name: str
     status: Status
-    lines: list[str]  # The findings in words, the most important first
-    numbers: dict[str, Any] = field(default_factory=dict)  # The findings as plain numbers, strings and lists
+    lines: list[str]  # Findings, the most important first
+    numbers: dict[str, Any] = field(default_factory=dict)  # Findings as plain numbers, strings and lists
     worst: tuple[int, int] | None = None  # Row and column of the pixel that shows the difference best
     maps: dict[str, NDArray[np.floating]] = field(default_factory=dict)  # (height, width) each, for the report
 
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Limits of the tiers: how much two images may differ. They are stored with the reference.
+    """Limits of the tiers for differences of two images, stored with the reference.
 
-    Those of the probe are at least four times as large as the differences between variants of Mitsuba (scalar against
-    LLVM: 6e-5 degrees, 1.2e-6 diagonals, 1.3e-5 in the parameters of a triangle), and small enough to notice one weight
-    of a refinement rule that is wrong by a thousandth (0.009 degrees, 1.2e-5 diagonals).
+    Limits of the probe are at least four times the differences between variants of Mitsuba (scalar and LLVM: 6e-5
+    degrees, 1.2e-6 diagonals, 1.3e-5 in the parameters of a triangle), and small enough to notice an error of a
+    thousandth in one weight of a refinement rule (0.009 degrees, 1.2e-5 diagonals).
     """
 
-    # Part of the pixels whose ray may hit another shape or element, or hit where the other image has nothing
+    # Share of pixels that may show another shape or element, or a hit in one image only
     mask_fraction: float = 1e-3
     # Degrees between shading normals away from silhouettes: 99.9th percentile and maximum
     angle_p999: float = 0.002
@@ -90,7 +90,7 @@ class Tolerances:
     uv_p999: float = 1e-3  # Difference of parameters where the same triangle is hit, 99.9th percentile
     paired_relative: float = 1e-5  # Relative difference of pixels with the same samples; 0 demands equal bits
     alpha: float = 0.01  # Probability that any scene of a suite without changes fails the tile tier
-    # What sums in single precision may add to the standard error of a tile: relative to its mean, and in radiance
+    # Addition to the standard error of a tile for sums in single precision: relative to its mean, and in radiance
     floor_relative: float = 2e-4
     floor_absolute: float = 1e-6
     # Mean and 95th percentile of FLIP
@@ -98,7 +98,7 @@ class Tolerances:
     flip_p95: float = 0.02
 
     def with_values(self, values: Mapping[str, Any]) -> Tolerances:
-        """Replace some. Raises RegressionError if a name is unknown, or a value no finite number of at least 0."""
+        """Replace some limits. Raises RegressionError for an unknown name, or a negative or non-finite value."""
         known = [field.name for field in fields(self)]
         for name, value in values.items():
             if name not in known:
@@ -118,7 +118,7 @@ def pixel_of_largest(values: NDArray[np.floating]) -> tuple[int, int]:
 
 
 def _skipped_without(name: str, reference: object | None, test: object | None, what: str) -> TierResult:
-    """Result of a tier that needs data of both images, where at least one of them lacks these."""
+    """Result of a tier whose data are missing in at least one of both images."""
     lacking = "images have" if reference is test is None else "reference has" if reference is None else "test has"
     return TierResult(name, Status.SKIPPED, [f"the {lacking} no {what}"])
 
@@ -126,9 +126,9 @@ def _skipped_without(name: str, reference: object | None, test: object | None, w
 def compare_probes(reference_image: Image, test_image: Image, tolerances: Tolerances) -> TierResult:
     """Compare the geometry probes of two images.
 
-    Normals, points and parameters are compared away from silhouettes. At a silhouette, where a pixel or one of its
-    eight neighbours hits another shape than its own neighbours or than the other probe, rounding decides what is hit.
-    Other triangles of the same surface are only a warning, since a mesh may be numbered in another order.
+    Normals, points and parameters are compared away from silhouettes, where rounding decides what a ray hits: where a
+    pixel or one of its eight neighbours hits another shape than its neighbours or than the other probe. Other triangles
+    of the same surface are only a warning, as the numbering of a mesh may change.
     """
     from scipy.ndimage import binary_dilation, generate_binary_structure, morphological_gradient
 
@@ -139,7 +139,7 @@ def compare_probes(reference_image: Image, test_image: Image, tolerances: Tolera
     both = reference.hit & test.hit
     other_shape = reference.shape != test.shape
     shapes = np.stack([reference.shape, test.shape])
-    # Pixels beside, above or below a pixel that hits another shape; then these and their eight neighbours.
+    # Pixels beside, above or below a pixel with another shape; then also their eight neighbours.
     cross = generate_binary_structure(2, 1)[None]
     edges = (morphological_gradient(shapes, footprint=cross, mode="nearest") > 0).any(axis=0) | other_shape
     inside = both & ~binary_dilation(edges, generate_binary_structure(2, 2))
@@ -162,7 +162,7 @@ def compare_probes(reference_image: Image, test_image: Image, tolerances: Tolera
         "uv_p999": _percentile(parameters[same_triangle]),
         "triangle_fraction": other_triangle,
     }
-    # Each measurement's name, limit, text, and value at each pixel.
+    # Name, limit, text and values per pixel of each measurement.
     criteria = [
         ("mask_fraction", tolerances.mask_fraction, "of the pixels hit another shape", other_shape),
         ("element_fraction", tolerances.mask_fraction, "of the pixels hit another element", other_element),
@@ -187,7 +187,7 @@ def compare_probes(reference_image: Image, test_image: Image, tolerances: Tolera
 
 
 def normal_angle(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Angle in degrees between unit vectors, accurate for tiny angles. Not a number where one of them is zero."""
+    """Angle in degrees between unit vectors, accurate for tiny angles. Not a number if one of them is zero."""
     with np.errstate(invalid="ignore", divide="ignore"):
         a, b = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (a.astype(np.float64), b.astype(np.float64)))
     return np.degrees(2 * np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1)))
@@ -198,10 +198,10 @@ def _percentile(values: NDArray[np.floating]) -> float:
 
 
 def compare_paired(reference: Image, test: Image, tolerances: Tolerances) -> TierResult:
-    """Compare the first batches of two images, which are drawn from the same samples.
+    """Compare the first batches of two images, which have the same samples.
 
-    Skipped, with the reason, where the samples are not the same. On another machine or with other versions of the
-    libraries, equal pixels still prove that nothing changed, but different ones prove nothing: the tier then warns.
+    Skipped, with the reason, if the samples are not the same. On another machine or with other versions of libraries,
+    equal pixels still prove that nothing changed, but different ones prove nothing: the tier then warns.
     """
     if reference.paired is None or test.paired is None:
         what = "first batch to pair (channels paired.R, paired.G, paired.B)"
@@ -233,9 +233,9 @@ def compare_paired(reference: Image, test: Image, tolerances: Tolerances) -> Tie
 
 
 def _noise_left(reference: Image, test: Image, estimate: Estimate) -> float:
-    """Part of both images' variance in their difference: 1, or less if they have all samples in common.
+    """Share of both images' variance in their difference: 1, or less if they have all samples in common.
 
-    Rounding then sends a few paths elsewhere; the first batches show how many.
+    Rounding then changes a few paths; the first batches show how many.
     """
     records = [image.metadata.get("sampling", {}) for image in (reference, test)]
     a, b = ([record.get(key) for key in ("seed", "batch", "batches")] for record in records)
@@ -247,28 +247,28 @@ def _noise_left(reference: Image, test: Image, estimate: Estimate) -> float:
 
 
 def levels(pixels: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Mean sizes of the channels' values ``(channels,)``; R, G and B have one in common."""
+    """Mean absolute values of the channels ``(channels,)``; R, G and B share one."""
     result = np.abs(pixels).mean(axis=(0, 1))
     result[:3] = result[:3].mean()
     return result
 
 
 def relative_difference(reference: NDArray[np.floating], test: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Map of the relative difference between two images, in the mean of R, G and B; less so where it is dark."""
+    """Map of the relative difference between two images, as the mean over R, G and B; reduced in dark pixels."""
     reference, test = reference[..., :3], test[..., :3]
     grey = 0.01 * np.abs(reference).mean() + 1e-12
     return (test.mean(axis=2) - reference.mean(axis=2)) / (np.abs(reference).mean(axis=2) + grey)
 
 
 def _different_samples(reference: Image, test: Image) -> str | None:
-    """Why the samples of two images are not the same, None if they are."""
+    """Reason why the samples of two images differ, None if they are the same."""
     for role, image in (("reference", reference), ("test", test)):
         if "paired" not in image.metadata:
             return f"the {role} does not say with which seed its first batch was rendered"
     keys = [*_SAME_SAMPLES, *(key for key in _IF_KNOWN if key in reference.metadata and key in test.metadata)]
     wanted, given = ({key: image.metadata.get(key) for key in keys} for image in (reference, test))
     for described in (wanted, given):
-        # Older references have the sampler's numbers of samples, too.
+        # Older references also contain the sampler's numbers of samples.
         if sampler := described.get("sampler"):
             described["sampler"] = without_sample_counts(sampler)
     if different := _differences(wanted, given):
@@ -293,14 +293,14 @@ def _in_words(value: Any) -> str:
 
 
 def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_size: int = 1) -> TierResult:
-    """Test each tile for whether noise alone explains its difference: two-sided tests, at several scales.
+    """Test whether noise alone explains the difference of each tile: two-sided tests, at several scales.
 
-    Each image's noise is its own, as its batches measure it. But a test of few samples may have missed a tile's rare
-    bright paths, and shows no noise then; so its noise is at least what the reference expects of as many samples. Of
-    images that have their samples in common, the noise is what rounding leaves. `_z_scores` has the formulas.
+    The batches of each image give its noise. A test of few samples may miss a tile's rare bright paths and show no
+    noise, so its noise is at least the reference's prediction for as many samples. For images with the same samples,
+    only rounding leaves noise. `_z_scores` has the formulas.
 
-    Single precision adds a bias, and so do spectra of colours: the standard error has a floor for that. Šidák's
-    correction covers the tiles and channels of a scale, Bonferroni's the scales and the scenes of a suite.
+    The standard error has a floor, for the bias of single precision and of spectra of colours. Šidák's correction
+    covers the tiles and channels of a scale, Bonferroni's the scales and the scenes of a suite.
     """
     expected, tested = reference.estimate, test.estimate
     if expected is None or tested is None:
@@ -308,7 +308,7 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
     for estimate, role in ((expected, "reference"), (tested, "test")):
         if estimate.batches < 2:
             return TierResult("tile", Status.SKIPPED, [f"the {role} has one batch only, which gives no variance"])
-    from scipy.special import log_ndtr, ndtr  # `scipy.stats` has names for these, but its import takes a second
+    from scipy.special import log_ndtr, ndtr  # `scipy.stats` is slow to import
 
     left = _noise_left(reference, test, expected)
     expected, tested = (replace(estimate, variance=left * estimate.variance) for estimate in (expected, tested))
@@ -319,7 +319,7 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
     are_spectral = {"spectral" in image.metadata.get("variant", "") for image in (reference, test)}
     if len(are_spectral) > 1:
         floor[..., :3] += SPECTRA * np.abs(reference.rgb).max(axis=2, keepdims=True)
-    # A test that is noisier in most tiles is so in tiles that missed rare paths.
+    # If a test is noisier in most tiles, it is also in tiles without rare paths.
     own, others = (_tile_sums(estimate.variance, NOISE_TILE) for estimate in (tested, expected))
     noisier = np.median(own[others > 0] / others[others > 0]) if others.any() else 1
     least = max(1.0, float(noisier)) * expected.variance
@@ -353,7 +353,7 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
         Status.FAIL if failing else Status.PASS,
         [f"noise explains every tile ({samples})"],
         {"scales": scales, "samples": spp, "failing": failing},
-        # The scale with the smallest probability, in units of its limit, shows the difference best.
+        # The scale with the smallest probability relative to its limit shows the difference best.
         maps={"z": strongest, "evidence": evidence[min(evidence)]},
     )
     if failing:
@@ -364,7 +364,7 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
         result.lines = [f"not noise ({samples}); tests that fail: {', '.join(counts)}", where.format(**clearest)]
         if len(are_spectral) > 1:
             result.lines.append("one variant is spectral: light between coloured surfaces differs from that of RGB")
-        # The pixel to look at lies in the smallest tile that failed.
+        # The worst pixel lies in the smallest failed tile.
         small = min(failing, key=lambda tile: (tile["width"] * tile["height"], -abs(tile["z"])))
         x, y = small["x"], small["y"]
         row, column = pixel_of_largest(np.abs(strongest[y : y + small["height"], x : x + small["width"]]))
@@ -380,9 +380,10 @@ def _z_scores(
 ) -> NDArray[np.float64]:
     """z-scores ``(rows, columns, channels)`` of the tiles of one size.
 
-    Let D be the difference of a tile's means and s^2 its variance, the sum of both sides'. Each is a sum of what its
-    pixels' batches measure, so that D / s has Student's distribution, with the degrees of freedom of [Welch 1947].
-    By [Wallace 1959], it becomes normal. The test has a least variance, and pixels have a least standard error.
+    Let D be the difference of a tile's means and s^2 its variance, the sum of both images'. Each is a sum over batches
+    of its pixels, so that D / s has Student's distribution, with the degrees of freedom of [Welch 1947]. It is
+    converted to a normal variable by [Wallace 1959]. The test has a least variance, and pixels have a least standard
+    error.
     """
     area = _tile_sums(np.ones((*test.count.shape, 1)), side)
     difference, bias = (_tile_sums(values, side) / area for values in (test.mean - reference.mean, floor))
@@ -390,7 +391,7 @@ def _z_scores(
     def measured(variance: NDArray[np.floating], count: NDArray[np.integer], batches: int) -> NDArray[np.float64]:
         """Variances of the means of tiles; and their squares over the degrees of freedom."""
         of_mean = variance / count[..., None]
-        # The square of a variance of n degrees of freedom is expected to be 1 + 2 / n times too large.
+        # The expected square of an estimated variance of n degrees of freedom is 1 + 2 / n times too large.
         return np.stack([_tile_sums(of_mean, side) / area**2, _tile_sums(of_mean**2, side) / area**4 / (batches + 1)])
 
     own, expected = measured(test.variance, test.count, test.batches), measured(least, test.count, reference.batches)
@@ -408,10 +409,10 @@ def _tile_sums(values: NDArray[np.floating], side: int) -> NDArray[np.float64]:
 
 
 def flip_exposures(pixels: NDArray[np.floating]) -> tuple[float, float, int]:
-    """First and last exposure for FLIP, in stops, and the number of exposures, chosen from a reference.
+    """First and last exposure for FLIP in stops, and their number, from a reference.
 
-    FLIP would end the whole process at a black image. As in FLIP, the first and the last exposure map the brightest and
-    the median luminance to 0.85 of the tone curve.
+    FLIP itself ends the process at a black image. As in FLIP, the first and the last exposure map the brightest and the
+    median luminance to 0.85 of the tone curve.
     """
     luminance = np.maximum(pixels, 0) @ _LUMINANCE
     brightest = float(luminance.max())
@@ -424,9 +425,9 @@ def flip_exposures(pixels: NDArray[np.floating]) -> tuple[float, float, int]:
 
 
 def compare_flip(reference: Image, test: Image, tolerances: Tolerances) -> TierResult:
-    """Compare two converged images as an eye does that flips between them.
+    """Compare two converged images by perception, as if alternating between them.
 
-    Raises RegressionError if FLIP is not installed, or pixels are not finite, to which it gives good scores.
+    Raises RegressionError if FLIP is not installed, or if pixels are not finite, which FLIP scores well.
     """
     try:
         import flip_evaluator
@@ -435,7 +436,7 @@ def compare_flip(reference: Image, test: Image, tolerances: Tolerances) -> TierR
     if not (np.isfinite(reference.pixels).all() and np.isfinite(test.pixels).all()):
         raise RegressionError("FLIP does not see pixels that are not finite; expected finite images")
     start, stop, count = flip_exposures(reference.rgb)
-    # Arrays, since FLIP ends the process at files that it cannot read; nonnegative, since its tone curve has poles.
+    # Arrays, as FLIP ends the process at unreadable files; nonnegative, as its tone curve has poles.
     arrays = [np.ascontiguousarray(np.maximum(image.rgb, 0), dtype=np.float32) for image in (reference, test)]
     exposures = {"startExposure": start, "stopExposure": stop, "numExposures": count, "tonemapper": "ACES"}
     without = {"applyMagma": False, "computeMeanError": False}
@@ -457,7 +458,7 @@ def compare_flip(reference: Image, test: Image, tolerances: Tolerances) -> TierR
 
 
 def _errors_of_others(reference: Image, test: Image) -> dict[str, NDArray[np.floating]]:
-    """What FLIP does not see: differences of alpha, and relative ones of layers and AOVs, by their names."""
+    """Differences that FLIP ignores: of alpha, and relative ones of layers and AOVs, by name."""
     errors: dict[str, NDArray[np.floating]] = {}
     for i, name in enumerate(reference.names[3:], start=3):
         a, b = np.abs(reference.pixels[..., i]), np.abs(test.pixels[..., i])

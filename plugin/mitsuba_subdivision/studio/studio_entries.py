@@ -279,7 +279,7 @@ def turned(azimuth: float) -> NDArray[np.float64]:
 
 
 def sampler(spp: int) -> SceneNode:
-    """A stratified sampler with at least this many samples, for ``mi.load_dict``.
+    """Entry of a well-stratified sampler with at least this many samples.
 
     Samples fill a grid: 32 become 5 times 7. Mitsuba would do so with a warning.
     """
