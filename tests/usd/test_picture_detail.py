@@ -374,6 +374,9 @@ def test_a_picture_that_repeats_needs_fewer_texels():
     often, once = (texture(to_uv=np.diag([repeats, repeats, 1.0])) for repeats in (4, 1))
     of_both = needed_for(square(), inputs={"base_color": often, "emission": once})["a.png"]
     assert of_both == pytest.approx(4 * needed_for(square(), inputs={"base_color": often})["a.png"])
+    # Along u, the image of one unit is 5 long.
+    slanted = texture(to_uv=np.array([[4.0, 0, 0], [3, 1, 0], [0, 0, 1]]))
+    assert of_both == pytest.approx(5 * needed_for(square(), inputs={"base_color": slanted})["a.png"])
 
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.float16, np.float32])
