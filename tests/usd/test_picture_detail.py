@@ -234,13 +234,24 @@ def test_what_is_too_few_or_too_much_stays_instances_and_much_is_told_with_numbe
         notes.warn("stage")
 
 
+def across(cage):
+    """Normals of quadrilaterals, as long as their areas."""
+    a, b, c, _ = np.moveaxis(cage.positions[cage.face_vertices].reshape(-1, 4, 3), 1, 0)
+    return np.cross(b - a, c - b)
+
+
 def test_copies_that_are_no_instances_are_one_shape_too():
     """With attributes, which Mitsuba looks up in the wrong place of instances."""
     kinds = {"heat": (8, "vertex"), "paint": (24, "face_varying")}
     attributes = {name: Attribute(np.arange(1.0 * count)[:, None], kind) for name, (count, kind) in kinds.items()}
-    shape, mirrored = cube_shape(scheme=None, attributes=attributes), np.diag([-1.0, 1, 1, 1])
-    shapes = [replace(shape, to_world=mirrored @ placed(k) if k else placed(k)) for k in range(COUNT)]
+    shape, mirrored, sheared = cube_shape(scheme=None, attributes=attributes), np.diag([-1.0, 1, 1, 1]), np.eye(4)
+    sheared[0, 1] = 0.5
+    shape = replace(shape, normals=np.repeat(across(CUBE), 4, axis=0))
+    shapes = [replace(shape, to_world=(mirrored if k else np.eye(4)) @ placed(k) @ sheared) for k in range(COUNT)]
     (joined,) = copied(scene(shapes, count=0))[0].shapes
+    normals, expected = joined.normals.reshape(-1, 4, 3), across(joined.cage)[:, None]
+    np.testing.assert_allclose(np.cross(normals, expected), 0, atol=1e-12)
+    assert ((normals * expected).sum(axis=2) > 0).all()
     heat, paint = (joined.cage.attributes[name] for name in ("heat", "paint"))
     np.testing.assert_array_equal(heat.values.ravel(), np.tile(np.arange(8.0), COUNT))
     # Faces of mirrored copies are turned over, with what their corners have.
