@@ -146,9 +146,9 @@ def test_tags_reach_both_half_edges_and_no_other_and_the_last_of_equal_ones_coun
     np.testing.assert_array_equal(cage.tags.edges, expected)
     np.testing.assert_array_equal(cage.tags.vertices, 2.5 * (np.arange(8) == 7))
     # An edge on a border has one half-edge only.
-    for plain in (cube(), sheet(2, 2)):
+    for plain, count in ((cube(), 2), (sheet(2, 2), 1)):
         cage = tagged(plain, creases=[(0, 1, 3), (1, 0, 4), (0, 1, 5), (1, 0, 2)])
-        np.testing.assert_array_equal(cage.tags.creases(cage.topology)[:, 2], [2])
+        assert cage.tags.edges[cage.tags.edges > 0].tolist() == [2] * count
 
 
 def test_creases_of_large_cages_are_found():

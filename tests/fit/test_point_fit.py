@@ -32,8 +32,13 @@ def test_a_surface_is_found_from_its_points(target, with_normals):
     points = target.sample(600, 1)
     start = moved(target.cage)
     assert distance(LimitSurface(start), target) > 50 * FOUND
-    normals = points.n if with_normals else None
-    fit = PointFit(start, points.p, normals, sliding=1e-3, regularizers={"bending": 0}).run(12)
+
+    def made(order):
+        normals = points.n[order] if with_normals else None
+        return PointFit(start, points.p[order], normals, sliding=1e-3, regularizers={"bending": 0})
+
+    fit = made(slice(None)).run(12)
+    assert made(np.random.default_rng(4).permutation(600)).step() == pytest.approx(fit.losses[0])
     assert distance(LimitSurface(fit.cage), target) < FOUND
     assert fit.losses[-1] < 1e-5 * fit.losses[0]
 

@@ -36,6 +36,13 @@ def test_rays_meet_the_points_that_they_are_aimed_at(name, variant, np_rng):
     np.testing.assert_allclose(vectors(again.p), p, rtol=0, atol=POINT[variant])
     inside = surface.scheme.domain.inside(np.array([hits.location.u, hits.location.v]).T)
     assert inside.min() >= 0
+    if variant == DOUBLE:
+        # Half of the points are too far away, along the line.
+        lengths = 0.1 * np.linalg.norm(d, axis=1)
+        line = (upload(kernel.types.vector3, array) for array in (target - 0.1 * d, d))
+        _, kind, _ = computed(kernel.line_hits(*line, hits.location, max_distance=np.median(lengths)))
+        is_near = lengths < np.median(lengths)
+        assert ((np.array(kind) == ON_LINE) == is_near).mean() > 0.98
 
 
 def met_past_a_border(kernel, surface, beyond, turns=0):

@@ -69,17 +69,19 @@ FILM = {"film_width": 64, "film_height": 48}
 
 @scalar
 def test_errors_are_in_the_world_and_pixels_of_displaced_shapes_as_well():
-    """The cage and the heights may be so many times as large, or the shape: it has the same triangles."""
+    """The cage and the heights may be so many times as large, or the shape; or the heights and their scale negative."""
     large = make(chord_error=1e-1, to_world=mi.ScalarTransform4f().scale(10))
     assert_same_triangles(large, make(chord_error=1e-2))
-    cage = cube(attributes={"height": np.linspace(0, 1, 8)[:, None]})
+    cage, hollow = (cube(attributes={"height": np.linspace(0, end, 8)[:, None]}) for end in (1, -1))
     seen = {"sensor_to_world": looking_at_the_middle([8, -12, 8]), "sensor_fov": 40.0, **FILM}
 
     def displaced(cage, displacement_scale, scale):
         heights = {"displacement": "vertex_height", "displacement_scale": displacement_scale}
         return make(cage, to_world=mi.ScalarTransform4f().scale(scale), pixel_error=0.25, **seen, **heights)
 
-    assert_same_triangles(displaced(cage, 0.5, 4), displaced(cage.with_positions(4 * cage.positions), 2.0, 1))
+    large = displaced(cage, 0.5, 4)
+    assert_same_triangles(large, displaced(cage.with_positions(4 * cage.positions), 2.0, 1))
+    assert_same_triangles(large, displaced(hollow, -0.5, 4))
 
 
 @scalar

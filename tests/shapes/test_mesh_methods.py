@@ -37,8 +37,8 @@ PLAIN = re.findall(
 REFUSED = ["ray_intersect", "ray_intersect_preliminary", "ray_test"]
 
 
-def made(shading):
-    return load(CAGE, tessellation_rate=RATE, shading=shading, bsdf={"type": "diffuse"})
+def made(shading, **more):
+    return load(CAGE, tessellation_rate=RATE, shading=shading, bsdf={"type": "diffuse"}, **more)
 
 
 def numbers(value):
@@ -181,6 +181,9 @@ def test_methods_under_exact_shading_use_the_surface_or_raise():
         frozen = dr.freeze(lambda shape, uv: shape.eval_parameterization(uv).p)
         np.testing.assert_array_equal(frozen(shape, upload(mi.Point2f, uv + shift)), si.p)
         update(shape, cage_texcoords=mi.traverse(shape)["cage_texcoords"] + 10)
+    mirrored = made("exact", to_world=mi.ScalarTransform4f().scale([1, 1, -1]))
+    found = mirrored.eval_parameterization(upload(mi.Point2f, uv)).uv
+    np.testing.assert_allclose(rows(found)[:3], uv[:3], atol=TEXTURE)
     normals = ": the mesh has no normals .* exact shading"
     refused(f"vertex_normal{normals}", shape.vertex_normal, 0)
     refused(f"recompute_vertex_normals{normals}", shape.recompute_vertex_normals)

@@ -156,6 +156,9 @@ def test_lost_gradients_warn(name, displacement, told):
     parameters, size = mi.traverse(scene), dr.opaque(mi.Float, 1)
     start = type(parameters[key])(parameters[key])
     dr.enable_grad(size)
+    if key.endswith("data"):
+        # What is assigned without a computation keeps its gradients.
+        dr.enable_grad(parameters[f"shape.{SCALE}"])
 
     def assign():
         update(parameters, {key: mi.AffineTransform4f().scale(size) if key.endswith("to_world") else start * size})

@@ -119,6 +119,8 @@ def test_existing_frames_are_kept(folder, capsys):
     import imageio.v3 as iio
 
     assert iio.imread("spin.gif").shape == (3, 15, 20, 3)
+    # Of a frame, in milliseconds, at the usual rate of 25 in a second.
+    assert iio.immeta("spin.gif")["duration"] == 40
 
 
 def test_a_video_without_encoder_names_the_extra(folder, capsys, monkeypatch):

@@ -144,6 +144,17 @@ def test_a_saved_scene_renders_to_the_same_picture(tmp_path, view):
 
 
 @scalar
+def test_saved_transforms_are_the_same(tmp_path):
+    turned = mi.ScalarTransform4f().translate([1, 2, 300]).rotate([1, 2, 3], 50)
+    placed = [turned, *(turned.scale(sides) for sides in ([2, 1, 0.5], [1, 1, -1]))]
+    placed += [turned.scale([2, 1, 1]).rotate([1, 1, 0], 30), mi.ScalarTransform4f().scale([2, 1, -1])]
+    scene = {f"shape{number}": {"type": "rectangle", "to_world": to_world} for number, to_world in enumerate(placed)}
+    saved = mi.load_file(str(save_scene({"type": "scene", **scene}, tmp_path / "s.xml")[-1]), optimize=False)
+    for shape, expected in zip(saved.shapes(), placed, strict=True):
+        np.testing.assert_allclose(mi.traverse(shape)["to_world"].matrix, expected.matrix, atol=1e-5)
+
+
+@scalar
 def test_a_scene_of_arrays_is_saved_with_its_cages(tmp_path):
     scene = studio_scene(named_cages.cube(), **SMALL)
     assert {path.name for path in save_scene(scene, tmp_path / "a.xml")} == {"a_surface.obj", "a_ground.obj", "a.xml"}

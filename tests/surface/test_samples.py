@@ -57,6 +57,20 @@ def test_samples_are_limit_stencils_applied_and_first_levels_as_eigencoordinates
     np.testing.assert_array_equal((samples.n == 0).all(axis=1), (expected.n == 0).all(axis=1))
 
 
+@pytest.mark.parametrize("scheme", ["catmull_clark", "doo_sabin"])
+def test_an_offset_moves_samples_at_extraordinary_points_into_their_elements(scheme):
+    """From corners of elements, and from centres of polygons, which have the parameter 1."""
+    surface = LimitSurface(mixed_torus(), scheme)
+    plain, moved = (surface.tessellate(2, sample_offset=offset).positions for offset in (0, 0.25))
+    moved = moved[np.linalg.norm(moved - plain, axis=1) > 1e-3]
+    elements = surface.patches.elements
+    face = np.tile(elements.face.astype(int), 2)
+    corner = np.tile(np.arange(len(face) // 2), 2) - elements.face_offsets[face]
+    at = surface.evaluate(face, np.repeat([[0.25] * 2, [0.75] * 2], len(face) // 2, axis=0), corner).p
+    assert len(moved) > 3
+    assert np.linalg.norm(moved[:, None] - at, axis=2).min(axis=1).max() < ROUNDED
+
+
 @EVERY_SURFACE
 def test_samples_do_not_depend_on_others(name, np_rng):
     surface = surface_named(name)

@@ -147,6 +147,9 @@ def test_cameras_have_names_shutters_intervals_and_still_frames_a_message(tmp_pa
     blurred = rendered(path, "--time", "0.5", "--shutter", "-0.25:0.75:2")
     halves = [rendered(path, "--time", time, samples=8) for time in ("0.5", "1")]
     assert np.abs(blurred - np.mean(halves, axis=0)).mean() < 0.25 * np.abs(halves[0] - halves[1]).mean()
+    # At rest, sub-frames have samples of their own.
+    one, both = (rendered(path, "--time", "7", "--shutter", f"0:1:{count}", samples=count) for count in (1, 2))
+    assert not np.array_equal(one, both)
     assert command(path, "--time", "1", "--shutter", "2") == 1
     assert "or an interval, such as --shutter -0.25:0.25" in capfd.readouterr().err
     assert command(write(tmp_path, STILL + DULL_SKY), "--frames", "1:2", to="f.exr") == 0
@@ -163,17 +166,15 @@ def of_unit(unit):
 
     whole, size = "bool inputs:normalize = 1\nfloat inputs:intensity =", (unit,) * 3
     glass = "float inputs:transmission = 1\ncolor3f inputs:transmission_color = (.9, .4, .3)\ntoken outputs:surface"
-    kind, depth = (
-        'uniform token info:id = "ND_standard_surface_surfaceshader"',
-        f"float inputs:transmission_depth = {unit}",
-    )
-    lens = (
-        f"float focusDistance = {11 * unit}\nfloat fStop = {0.5 / unit}\nfloat2 clippingRange = ({unit}, {99 * unit})"
-    )
+    kind = 'uniform token info:id = "ND_standard_surface_surfaceshader"'
+    depth = f"float inputs:transmission_depth = {unit}"
+    lens = f"float focusDistance = {11 * unit}\nfloat fStop = {0.5 / unit}\n"
+    lens += f"float2 clippingRange = ({unit}, {99 * unit})"
     parts = [
         prim("Mesh", "box", CUBE, POLYGONS, at(0, 0, 1, scale=size)),
         mesh("ball", CUBE, bound("glass"), at(2, -1, 0.7, scale=size)),
         prim("Mesh", "floor", SQUARE, moved(scale=(8 * unit,) * 3)),
+        prim("DistantLight", "sun", f"{whole} 0.5"),
         prim("SphereLight", "sphere", f"float inputs:radius = {unit}\nfloat inputs:intensity = 30", at(-3, -3, 5)),
         prim("RectLight", "rect", f"{whole} {60 * unit**2}", at(3, 0, 5, scale=size)),
         prim("SphereLight", "point", f"bool treatAsPoint = 1\n{whole} {20 * unit**2}", at(0, 3, 3)),

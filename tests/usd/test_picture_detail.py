@@ -234,13 +234,24 @@ def test_few_or_too_large_instances_stay_and_large_ones_warn_with_numbers(monkey
         notes.warn("stage")
 
 
+def across(cage):
+    """Normals of quadrilaterals, as long as their areas."""
+    a, b, c, _ = np.moveaxis(cage.positions[cage.face_vertices].reshape(-1, 4, 3), 1, 0)
+    return np.cross(b - a, c - b)
+
+
 def test_copies_other_than_instances_are_merged_too():
     """With attributes, which Mitsuba looks up in the wrong place of instances."""
     kinds = {"heat": (8, "vertex"), "paint": (24, "face_varying")}
     attributes = {name: Attribute(np.arange(1.0 * count)[:, None], kind) for name, (count, kind) in kinds.items()}
-    shape, mirrored = cube_shape(scheme=None, attributes=attributes), np.diag([-1.0, 1, 1, 1])
-    shapes = [replace(shape, to_world=mirrored @ placed(k) if k else placed(k)) for k in range(COUNT)]
+    shape, mirrored, sheared = cube_shape(scheme=None, attributes=attributes), np.diag([-1.0, 1, 1, 1]), np.eye(4)
+    sheared[0, 1] = 0.5
+    shape = replace(shape, normals=np.repeat(across(CUBE), 4, axis=0))
+    shapes = [replace(shape, to_world=(mirrored if k else np.eye(4)) @ placed(k) @ sheared) for k in range(COUNT)]
     (joined,) = copied(scene(shapes, count=0))[0].shapes
+    normals, expected = joined.normals.reshape(-1, 4, 3), across(joined.cage)[:, None]
+    np.testing.assert_allclose(np.cross(normals, expected), 0, atol=1e-12)
+    assert ((normals * expected).sum(axis=2) > 0).all()
     heat, paint = (joined.cage.attributes[name] for name in ("heat", "paint"))
     np.testing.assert_array_equal(heat.values.ravel(), np.tile(np.arange(8.0), COUNT))
     # Faces of mirrored copies are turned over, with what their corners have.
@@ -374,6 +385,9 @@ def test_a_picture_that_repeats_needs_fewer_texels():
     often, once = (texture(to_uv=np.diag([repeats, repeats, 1.0])) for repeats in (4, 1))
     of_both = needed_for(square(), inputs={"base_color": often, "emission": once})["a.png"]
     assert of_both == pytest.approx(4 * needed_for(square(), inputs={"base_color": often})["a.png"])
+    # Along u, the image of one unit is 5 long.
+    slanted = texture(to_uv=np.array([[4.0, 0, 0], [3, 1, 0], [0, 0, 1]]))
+    assert of_both == pytest.approx(5 * needed_for(square(), inputs={"base_color": slanted})["a.png"])
 
 
 @pytest.mark.parametrize("dtype", [np.uint16, np.float16, np.float32])

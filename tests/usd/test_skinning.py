@@ -61,7 +61,7 @@ def write(
     offsets = f"uniform vector3f[] offsets = {listed(np.stack([BULGE, -BULGE]))}"
     bulge = prim("BlendShape", "bulge", "uniform int[] pointIndices = [8, 9]", offsets)
     mesh = [
-        moved(translate=tuple(PLACE.tolist())),
+        moved(translate=tuple(PLACE.tolist()), scale=(2, 2, 2)),
         f"point3f[] points = {listed(points)}",
         f"int[] faceVertexCounts = {[4] * 16}",
         f"int[] faceVertexIndices = {quads.ravel().tolist()}",
@@ -95,7 +95,7 @@ def test_joints_and_blend_shapes_move_control_points(tmp_path, time):
     np.testing.assert_allclose(cage.positions, expected, atol=FLOAT32)
     assert not cage.attributes
     (shape,) = StageReader(path).at(time).shapes
-    np.testing.assert_allclose(shape.cage.positions + shape.to_world[:3, 3], expected, atol=FLOAT32)
+    np.testing.assert_allclose(2 * shape.cage.positions + shape.to_world[:3, 3], expected, atol=FLOAT32)
 
 
 def test_dual_quaternions_blend_a_twist_by_its_angle(tmp_path):
@@ -130,7 +130,7 @@ def test_instances_with_their_own_animation_have_their_own_points(tmp_path):
         crowd += prim("", name, source, apis=apis, head=head.format("@./stage.usda@</body>"))
     contents = StageReader(stages.write(tmp_path, crowd, "crowd.usda")).at(1)
     lowest = sorted(shape.cage.positions[:, 1].min() for shape in contents.all_shapes)
-    np.testing.assert_allclose(lowest, [0, 7], atol=FLOAT32)
+    np.testing.assert_allclose(lowest, [0, 3.5], atol=FLOAT32)
 
 
 def test_unsupported_joints_warn(tmp_path):
@@ -139,4 +139,4 @@ def test_unsupported_joints_warn(tmp_path):
         StageReader(path).at(5)
     with pytest.warns(CageWarning, match="/body/tube: joints and blend shapes are ignored"):
         positions = read_usd(path, time=5).positions
-    np.testing.assert_allclose(positions, tube()[0] + PLACE, atol=FLOAT32)
+    np.testing.assert_allclose(positions, 2 * tube()[0] + PLACE, atol=FLOAT32)
