@@ -60,9 +60,11 @@ def flushed_output() -> Iterator[None]:
 
 def counted(items: Sequence[T], what: str) -> Iterator[T]:
     """Iterate over items, and count them on a terminal after the word ``what``."""
+    if not _is_terminal():
+        return iter(items)
     from tqdm import tqdm  # Only here, as it takes some time to import
 
-    return iter(tqdm(items, desc=what, leave=False, delay=PATIENCE, disable=not _is_terminal()))
+    return iter(tqdm(items, desc=what, leave=False, delay=PATIENCE))
 
 
 @contextmanager

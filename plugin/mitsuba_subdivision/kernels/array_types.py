@@ -106,16 +106,28 @@ def arrays_in(value: Any, seen: set[int]) -> Iterator[Any]:
 
 
 class LaterArrays:
-    """A shared value that computes its arrays at their first use in each thread.
+    """A shared value that computes its arrays at their first use in each thread, until they are `settled`.
 
     Kernels of a thread do not wait for those of another, and waiting would begin other work that Dr.Jit has queued.
     """
 
     # Without `__dict__`, so that Dr.Jit does not traverse it as a shape's state.
-    __slots__ = ("__weakref__",)
+    __slots__ = ("__weakref__", "_settled")
+
+    def __init__(self) -> None:
+        self._settled: Any = None
+
+    def settled(self) -> Any:
+        """The arrays that all threads use from now on. All kernels of this thread must have ended."""
+        own = _of_thread.__dict__.get("arrays", {}).pop(self, None)
+        if self._settled is None:
+            self._settled = own
+        return self._settled
 
     def get(self, compute: Callable[[], Any]) -> Any:
         """Return the arrays; the first call in a thread computes them."""
+        if self._settled is not None:
+            return self._settled
         computed = _of_thread.__dict__.setdefault("arrays", WeakKeyDictionary())
         if self not in computed:
             computed[self] = compute()

@@ -26,15 +26,14 @@ class ChannelKernel:
     def __init__(self, channel: Channel, float_type: type) -> None:
         types, size = ArrayTypes(float_type), channel.values.shape[1]
         self._pieces: PieceKernel | None = None
-        linear_map: SparseMatrix | CoefficientMap
+        how: tuple = _linear_map, channel
         if channel.layout.is_linear:
             # A polynomial for each half-edge
             self._monomials = Monomials(_POWERS[: channel.layout.patches.scheme.domain.corner_count])
-            linear_map = SparseMatrix(channel.linear_polynomials, float_type, is_relative=False)
         else:
             table = PieceTable.build(channel.layout.patches, channel.layout.value_index, len(channel.values))
-            self._pieces, linear_map = shared(PieceKernel, table, float_type), shared(CoefficientMap, table, float_type)
-        self._types, self.values = types, ControlValues(types, size, linear_map).load(channel.values)
+            self._pieces, how = shared(PieceKernel, table, float_type), (CoefficientMap, table)
+        self._types, self.values = types, ControlValues(types, size, *how).load(channel.values)
 
     def __call__(self, location: Location, active: Mask = True) -> tuple[Value, Value, Value]:
         """The value, and its derivatives by the parameters."""
@@ -61,3 +60,7 @@ class ChannelKernel:
         vector = self._types.vector(self.values.size)
         value, by_u, by_v, *second = (vector(*numbers) for numbers in zip(*components, strict=True))
         return PatchValues(value, by_u, by_v, value * 0, tuple(second))
+
+
+def _linear_map(channel: Channel, float_type: type) -> SparseMatrix:
+    return SparseMatrix(channel.linear_polynomials, float_type, is_relative=False)

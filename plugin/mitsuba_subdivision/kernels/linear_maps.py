@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..evaluation.polynomials import polynomial_basis
 from ..mesh import ragged
-from ..mesh.shared import Content, shared_by_key
+from ..mesh.shared import Content, shared, shared_by_key
 from ..patches.piece_table import PACKET, PieceTable, piece_packets
 from .array_types import (
     NO_CONFLICTS,
@@ -346,13 +346,18 @@ def _piece_blocks(
 class ControlValues:
     """What a linear map makes of the values of a cage, in one array that kernels gather from."""
 
+    # See `arrays_in`.
+    UPLOADED_LATER = ("linear_map",)
+
     def __init__(
         self,
         types: ArrayTypes,
         size: int,  # Number of components of a value
-        linear_map: SparseMatrix | CoefficientMap,
+        # Makes a `SparseMatrix` or a `CoefficientMap` of its table and the type of numbers
+        make: Callable[[Any, type], Any],
+        table: Any,
     ) -> None:
-        self._types, self.size, self._map = types, size, linear_map
+        self._types, self.size, self._make = types, size, (make, table, types.float)
         # Never replaced, because other objects may hold a reference to the array.
         self.flat: FloatBuffer = types.float()
         # Keeps the array that is shared with objects of equal values.
@@ -363,19 +368,28 @@ class ControlValues:
 
         Objects with equal values and the same map share the array until `set` is called.
         """
-        linear_map = self._map
-        self._shared = shared_by_key((LaterArrays, linear_map, Content(values)), LaterArrays)
-        self.take(self._shared.get(lambda: linear_map(self._types.floats(values), self.size)))
+        self._shared = shared_by_key((LaterArrays, *self._make, Content(values)), LaterArrays)
+        self.take(self._shared.get(lambda: self.linear_map(self._types.floats(values), self.size)))
         return self
+
+    def settle(self) -> None:
+        """Keep loaded values only, until others are set. All kernels of this thread must have ended."""
+        vars(self).pop("linear_map", None)
+        if self._shared is not None:
+            self.take(self._shared.settled())
+
+    @cached_property
+    def linear_map(self) -> SparseMatrix | CoefficientMap:
+        return shared(*self._make)
 
     def set(self, values: FloatBuffer) -> None:
         """Set the values of the cage, flat. Later lookups are attached to them."""
         self._shared = None
-        self.take(self._map(values, self.size))
+        self.take(self.linear_map(values, self.size))
 
     def attach(self, values: FloatBuffer) -> None:
         """Attach the array to the values of the cage that it was computed from again."""
-        self.take(self._map(values, self.size, dr.detach(self.flat)))
+        self.take(self.linear_map(values, self.size, dr.detach(self.flat)))
 
     def take(self, flat: FloatBuffer) -> None:
         """Set the array itself, or attach an equal one to other variables."""

@@ -97,7 +97,7 @@ class SurfaceKernel:
         # to the heights and their scale.
         self.displacement: Displacement | None = None
         self._control_count = table.control_count
-        self.values = ControlValues(self.types, 3, shared(CoefficientMap, table, float_type))  # Its control points
+        self.values = ControlValues(self.types, 3, CoefficientMap, table)  # Its control points
 
     def set_control_points(self, points: FloatBuffer) -> None:
         """Set the control points. Later results are differentiable with respect to them.

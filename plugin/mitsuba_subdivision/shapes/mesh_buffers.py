@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, NamedTuple
 from weakref import WeakMethod
 
@@ -54,6 +54,9 @@ class MeshBuffers:
     from other variables, that computation is lost: gradients end at the parameters, and `BackwardPasses` warns.
     """
 
+    # See `arrays_in`.
+    UPLOADED_LATER = ("_kernel",)
+
     def __init__(
         self,
         variant: Variant,
@@ -83,15 +86,11 @@ class MeshBuffers:
         """Choose the triangles, and the vertices to evaluate."""
         self.table, self.layout, self._kept = triangles.table, triangles.layout, Content(triangles.kept)
         table, layout = self.table, self.layout
-        self._kernel: VertexKernel | None = None
-        if self._types is not None and not self._is_sampled:
-            from ..kernels.vertex_kernel import VertexKernel
-
-            self._kernel = shared(VertexKernel, table, self._types.float)
+        vars(self).pop("_kernel", None)
         # Used by the first evaluation alone, and kept alive for those of other shapes; None if vertices are not shared.
         self._loaded: LaterArrays | None = None
         if not self._is_sampled and table.vertex_count <= MOST_SHARED:
-            key = LaterArrays, self._kernel or table, self._parameters.surface.cage
+            key = LaterArrays, table, self._variant.Float, self._parameters.surface.cage
             self._loaded = shared_by_key(key, LaterArrays)
         self._is_loaded = True
         # Index of each vertex of the mesh among those of the tessellation, if seams have copies
@@ -126,22 +125,43 @@ class MeshBuffers:
             self.passes.begin(sources)
         # Free the memory of the last evaluation before the next one.
         self._evaluated = None
-        evaluate = partial(self._on_host if self._kernel is None else self._kernel.evaluated, dr.detach(points))
+        evaluate = partial(self._vertices, dr.detach(points))
         vertices: tuple[FloatBuffer, FloatBuffer] = evaluate() if loaded is None else loaded.get(evaluate)
-        if self._kernel is None:
-            return self._placed(*vertices, points)
         # Also kept for a displacement, as gradients of heights may be enabled later.
         self._evaluated = vertices if moves or self._displacement is not None else None
-        return self._placed(*self._kernel.attached(points, *vertices), points)
+        return self._placed(*self._attached(vertices, points), points)
 
     def attached(self, control_points: FloatBuffer) -> dict[str, FloatBuffer]:
         """Attach exact shading and the buffers of the last evaluation to the parameters again."""
         points, surface = self._placement.relative(control_points), self._surface
         if surface is not None and dr.grad_enabled(points):
             surface.values.attach(points)
-        if self._kernel is None or self._evaluated is None:
+        if self._evaluated is None:
             raise RuntimeError("vertices were not kept; expected an evaluation with derivatives before")
-        return self._placed(*self._kernel.attached(points, *self._evaluated), points)
+        return self._placed(*self._attached(self._evaluated, points), points)
+
+    def settle(self) -> None:
+        """Drop what only updates need, after loading. All kernels of this thread must have ended."""
+        vars(self).pop("_kernel", None)
+        if self._loaded is not None:
+            self._loaded.settled()
+
+    @cached_property
+    def _kernel(self) -> VertexKernel | None:
+        if self._types is None or self._is_sampled:
+            return None
+        from ..kernels.vertex_kernel import VertexKernel
+
+        return shared(VertexKernel, self.table, self._types.float)
+
+    def _attached(
+        self, vertices: tuple[FloatBuffer, FloatBuffer], points: FloatBuffer
+    ) -> tuple[FloatBuffer, FloatBuffer]:
+        is_moving = self.are_differentiable and dr.grad_enabled(points)
+        return self._kernel.attached(points, *vertices) if is_moving and self._kernel is not None else vertices
+
+    def _vertices(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
+        return self._on_host(points) if self._kernel is None else self._kernel.evaluated(points)
 
     def _sources(self, control_points: FloatBuffer) -> list:
         heights = [] if self._displacement is None else self._displacement.variables()

@@ -129,6 +129,10 @@ def make_subdivision(
             # The triangles over texture coordinates; None until they are needed. Frozen functions find its arrays here.
             self._texture_scene: Any = None
             self._assemble(moves_points=False)
+            # Mitsuba has waited for the bounding box, and so for all kernels of this thread.
+            self._mesh.settle()
+            for values in [channel.values for channel in channels.values()] + ([on_device.values] if on_device else []):
+                values.settle()
 
         def _triangles(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> Triangles:
             parameters, surface = self._parameters, self._parameters.surface
