@@ -138,10 +138,24 @@ def pixels_of(cage: CageContents, to_world: NDArray[np.float64], seen: Views) ->
     return float((np.linalg.norm(to_world[:, :3, :3], 2, axis=(1, 2)) * pixels).max())
 
 
+def largest_height(shape: ShapeContents, textures: Textures, notes: StageWarnings) -> float:
+    """Largest distance by which a displacement moves a surface, in its space; 0 for textures of Mitsuba's own."""
+    given, scale = heights(shape, textures, notes)
+    if isinstance(given, float):
+        return abs(given * scale)
+    is_attribute = given["type"] == "mesh_attribute"
+    attribute = shape.cage.attributes[given["name"].removeprefix("vertex_")].values if is_attribute else 0.0
+    return float(np.abs(_pixels(given) if "bitmap" in given else attribute).max() * abs(scale))
+
+
+def _pixels(texture: SceneNode) -> NDArray:
+    pixels = np.array(texture["bitmap"])
+    return pixels.reshape(pixels.shape[:2]) / (255.0 if pixels.dtype == np.uint8 else 1.0)
+
+
 def rate_of_heights(cage: CageContents, texture: SceneNode, error: float) -> int:
     """Segments on each edge whose chords are within an error of most heights of a bitmap of one channel."""
-    pixels = np.array(texture["bitmap"])
-    heights = pixels.reshape(pixels.shape[:2]) / (255.0 if pixels.dtype == np.uint8 else 1.0)
+    heights = _pixels(texture)
     length = 1  # In texels, powers of two
     while 4 * length <= min(heights.shape):
         away = [np.abs(h[2 * length :] + h[: -2 * length] - 2 * h[length:-length]) / 2 for h in (heights, heights.T)]

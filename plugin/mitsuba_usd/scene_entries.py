@@ -157,30 +157,42 @@ class Surfaces:
         self.messages[surface] = messages
         return surface
 
-    def points(self, contents: SceneContents) -> NDArray[np.float64]:
-        """Points ``(n, 3)`` in the world: of shapes, on or around limit surfaces, and of boxes of groups."""
-        of_shapes = [self._points_of(shape) for shape in counted(contents.shapes, "Limit surfaces")]
+    def points(
+        self, contents: SceneContents, heights: Mapping[ShapeContents, float] | None = None
+    ) -> NDArray[np.float64]:
+        """Points ``(n, 3)`` in the world: of shapes, on or around limit surfaces, and of boxes of groups.
+
+        Points of displaced surfaces are those of boxes around them, as large as the heights.
+        """
+
+        def points_of(shape: ShapeContents) -> NDArray[np.float64]:
+            height = (heights or {}).get(shape, 0.0)
+            corners = box_corners(np.array([[-height] * 3, [height] * 3]))[: 8 if height else 1]
+            return points_at((self._points_of(shape)[:, None] + corners).reshape(-1, 3), shape.to_world)
+
+        of_shapes = [points_of(shape) for shape in counted(contents.shapes, "Limit surfaces")]
         boxes = []
         for group in contents.groups:
-            inside = np.concatenate([_NO_POINTS, *map(self._points_of, group)])
+            inside = np.concatenate([_NO_POINTS, *map(points_of, group)])
             boxes.append(box_corners(np.stack([inside.min(axis=0), inside.max(axis=0)])) if len(inside) else inside)
         of_instances = [points_at(boxes[instance.group], instance.to_world) for instance in contents.instances]
         points = np.concatenate([_NO_POINTS, *of_shapes, *of_instances])
         return np.asarray(points[np.isfinite(points).all(axis=1)])
 
     def _points_of(self, shape: ShapeContents) -> NDArray[np.float64]:
+        """Points in the space of the shape."""
         cage, key = shape.cage, (shape.name, shape.material.name if shape.material else None)
+        positions = np.asarray(cage.positions, dtype=np.float64)
         if cage.scheme is None:
-            return points_at(cage.positions, shape.to_world)
+            return positions
         if key not in self._of_shape or not same_topology(self._of_shape[key][0], cage):
             try:
                 self._of_shape[key] = cage, self.of(cage)
             except SchemeError:
-                return points_at(cage.positions, shape.to_world)  # Shown as polygons
+                return positions  # Shown as polygons
             except CageError:
                 return _NO_POINTS  # Its entry issues the error
-        sampled = self._sampling(self._of_shape[key][1])(np.asarray(cage.positions, dtype=np.float64))
-        return points_at(sampled, shape.to_world)
+        return self._sampling(self._of_shape[key][1])(positions)
 
 
 def _sampling(surface: LimitSurface) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:

@@ -26,6 +26,7 @@ BASES: dict[str, NDArray[np.float64]] = {
 }
 # Sine of the largest angle between tubes without a gap, and largest ratio of lengths of uniform transforms.
 _STRAIGHT, _EVEN = 1e-3, 1.001
+_WIRE = 1e-3  # Width of curves without widths, relative to their size
 _PLACES = (np.arange(8)[:, None] + 0.5) / 8  # Parameters along each segment at which colours are sampled
 
 
@@ -123,11 +124,14 @@ def read_curves(
     has_widths = primvar.HasValue()
     widths = _flattened(primvar, time) if has_widths else _numbers(value_at(curves.GetWidthsAttr(), time), 1)
     of_widths = str(primvar.GetInterpolation() if has_widths else curves.GetWidthsInterpolation())
+    is_wire = not len(widths)
+    widths = np.full((1, 1), _WIRE * np.ptp(points, axis=0).max()) if is_wire else widths
     of_widths = "constant" if len(widths) == 1 else of_widths
     if not topology.has(len(widths), of_widths) or not (widths >= 0).all():
         raise ValueError(f"there are {len(widths)} {of_widths} widths; expected one for each, 0 or more")
     sizes = np.linalg.svd(to_world[:3, :3], compute_uv=False)
     problems = {
+        "curves without widths are wires of a thousandth of their size": is_wire,
         "curves with too few points are left out": not topology.segments.all(),
         "normals of curves are ignored; Mitsuba's curves are tubes": value_at(curves.GetNormalsAttr(), time),
         "skeletons of curves are ignored": prim.HasAPI(UsdSkel.BindingAPI),

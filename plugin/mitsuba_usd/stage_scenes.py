@@ -24,6 +24,7 @@ from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
 from .picture_detail import (
     is_chosen,
+    largest_height,
     segments_of,
     texels_for_pictures,
     triangles_for_picture,
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from .stage_walk import StageReader
 
 _OF_CAMERA = frozenset({"camera", "picture"})  # Fields of contents that may differ between frames of one loaded scene
+_MOST_FRAMED = 256  # Pixels along the sides of textures of heights for the studio's camera
 _TRAVERSED = {"fov": "x_fov"}  # Names of parameters of sensors in `mi.traverse`; the field of view is along x
 
 
@@ -140,7 +142,13 @@ class StageScenes(studio.SceneSource[SceneContents]):
         return contents.up, angles_for(contents, self._look), size_for(contents, self._look)
 
     def points(self, contents: SceneContents) -> NDArray[np.float64]:
-        return self._surfaces.points(contents)
+        if contents.camera is not None or "displacement" in self._parameters:
+            return self._surfaces.points(contents)
+        # The studio's camera sees displaced surfaces.
+        textures = Textures(self._notes, most=_MOST_FRAMED)
+        displaced = [shape for shape in contents.all_shapes if shape.is_displaced]
+        heights = {shape: largest_height(shape, textures, self._notes) for shape in displaced}
+        return self._surfaces.points(contents, heights)
 
     def has_studio(self, contents: SceneContents) -> bool:
         return contents.camera is None or not contents.is_lit

@@ -4,7 +4,8 @@ import mitsuba as mi
 import mitsuba_subdivision as msub
 import numpy as np
 import pytest
-from mitsuba_usd import copies
+from mitsuba_subdivision.studio import Look
+from mitsuba_usd import StageScenes, copies
 from usd import stages
 from usd.stages import CUBE, SQUARE, bound, camera, mesh, moved, prim, shader, texture, told
 from usd.test_usd_scene import instancer
@@ -84,6 +85,15 @@ def test_primvars_are_heights(points, variant_scalar_rgb):  # noqa: ARG001
         z = points(text, SHEET, PRIMVAR.format([0.1, 0.3, 0.3, 0.1], "vertex"))[:, 2]
         np.testing.assert_allclose([z.min(), z.max()], [0.1 * factor, 0.3 * factor], atol=ROUNDING)
         np.testing.assert_allclose(points(text, SHEET, PRIMVAR.format([0.2], "constant"))[:, 2], 0.2 * factor)
+
+
+def test_the_camera_of_the_studio_sees_displaced_surfaces(tmp_path, variant_scalar_rgb):  # noqa: ARG001
+    stages.flat(tmp_path / "heights.png", (255,))
+    primvar = PRIMVAR.format([0.1, -0.3, 0.1, 0.1], "vertex")
+    for text in (paint(f"{HEIGHT} = -0.3"), paint(HEIGHTS, READER), paint(HEIGHTS, SCALED)):
+        path = stages.write(tmp_path, text + mesh("sheet", SHEET, primvar, bound()))
+        source = StageScenes(path, Look(), {})
+        assert np.ptp(source.points(source.at())[:, 2]) == pytest.approx(0.6)
 
 
 @pytest.mark.parametrize("least", [2, 9])

@@ -125,6 +125,7 @@ def test_colours_along_curves(tmp_path, interpolation, values, expected, binding
     ("change", "message"),
     [
         (("(0, 0, 0)", "(0, 5, 0)"), "cubic curves with corners have gaps there"),
+        (("float[] widths", "float[] sizes"), "curves without widths are wires of a thousandth of their size"),
         (("[7, 7]", "[7, 3, 4]"), "curves with too few points are left out"),
         (("point3f[]", f"{moved(scale=(1, 1, 2))}point3f[]"), "curves stay round where transforms stretch them"),
         (("[0.4]", "[0.4, 0.4, 0.4]"), "there are 3 constant widths; expected one for each, 0 or more"),

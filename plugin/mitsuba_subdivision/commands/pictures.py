@@ -43,8 +43,7 @@ _OF_STAGES = ("shutter", "texture_size", "camera", "over")
 # Options that are also fields of `Look`.
 _OF_LOOK = ("up", "size", "spp", "rate", "checker", "cage", "texture_size", "transparent", "aovs")
 EVEN = 2  # Sides of pictures in MP4 files are multiples of this; others lose a row or a column
-_Animation = FrameRange | Turntable | StillPicture
-_Shown = tuple[_Animation, SceneSource[Any]]
+_Shown = tuple[StillPicture, SceneSource[Any]]
 
 
 class Picture(NamedTuple):
@@ -236,7 +235,7 @@ def _kept(command: bytes) -> tuple[argparse.Namespace, _Shown]:
 def _shown(options: argparse.Namespace) -> _Shown:
     """The pictures of a model, and their scene source."""
     source = _source(options)
-    shown: _Animation
+    shown: StillPicture
     if options.frames or options.shutter:
         shown = FrameRange(source, options.frames or range(1, 2))
     elif options.turntable:

@@ -1,8 +1,4 @@
-"""A still picture, a turntable and a range of frames of a scene source, for the command ``render``.
-
-Each has ``scene``, the entries of its first frame, and ``frames``, which loads the scenes of some frames, one after the
-other.
-"""
+"""A still picture, a turntable and a range of frames of a scene source, for the command ``render``."""
 
 from __future__ import annotations
 
@@ -108,16 +104,25 @@ class SceneSource(ABC, Generic[Contents]):
 
 
 class StillPicture:
-    """One picture of a source. Triangles may depend on the sensor if no other one renders the scene."""
+    """One picture of a source, and the base of moving ones.
+
+    Triangles may depend on the sensor if no other one renders the scene.
+    """
 
     def __init__(self, source: SceneSource[Any], *, follows_sensor: bool = True) -> None:
-        self.scene: SceneNode = source.scene(source.at(), follows_sensor=follows_sensor)
+        self._scene = source.scene(source.at(), follows_sensor=follows_sensor)
+
+    @property
+    def scene(self) -> SceneNode:
+        """Entries of the first frame."""
+        return self._scene
 
     def frames(self, numbers: Sequence[int], filter_name: str | None) -> Iterator[LoadedScene]:
+        """Loaded scenes of some frames, one after the other."""
         return (load_quietly(self.scene, filter_name) for _ in numbers)
 
 
-class Turntable:
+class Turntable(StillPicture):
     """A cage or a stage that turns once, in frames 1 to ``count``, around the middle of its bounds.
 
     In Mitsuba, the camera turns around the model the other way, with the lights and the backdrop of the studio. The
@@ -137,7 +142,7 @@ class Turntable:
             turned_points = (points_at(points, self.matrix(number)) for number in numbers)
             points = np.concatenate([outermost(frame, *framing) for frame in turned_points])
         turns = [self.matrix(2 - number) for number in numbers] if follows_sensor else []
-        self.scene: SceneNode = source.scene(contents, points, turns=turns)
+        self._scene = source.scene(contents, points, turns=turns)
 
     def matrix(self, number: float) -> NDArray[np.float64]:
         """Transform ``(4, 4)`` of the contents in frame ``number``."""
@@ -147,7 +152,7 @@ class Turntable:
         return matrix
 
     def frames(self, numbers: Sequence[float], filter_name: str | None) -> Iterator[LoadedScene]:
-        """The scene at each of these frames; it is loaded once."""
+        """Loaded scenes of some frames; the scene is loaded once."""
         loaded = load_quietly(self.scene, filter_name)
         parameters = mi.traverse(loaded.scene)
         names = [f"{name}.to_world" for name in ("sensor", *RIG) if name in self.scene]
@@ -159,7 +164,7 @@ class Turntable:
             yield loaded
 
 
-class FrameRange:
+class FrameRange(StillPicture):
     """Times of a USD file, or the files of frames. The studio's camera stands still, and sees all frames.
 
     Raises CageError, OSError if a frame cannot be read, or nothing is visible in any of them.
