@@ -108,9 +108,8 @@ class Export:
         self.values[path] = value, self.time, moves or old != value
 
     def put_matrix(self, prim, matrix):
-        place = UsdGeom.Xformable(prim)
-        numbers = [number for column in matrix.transposed() for number in column]
-        self.put((place.GetTransformOp() or place.AddTransformOp()).GetAttr(), Gf.Matrix4d(*numbers))
+        place, rows = UsdGeom.Xformable(prim), [*map(list, matrix.transposed())]
+        self.put((place.GetTransformOp() or place.AddTransformOp()).GetAttr(), Gf.Matrix4d(rows))
 
 
 def _object_of(prim):
@@ -157,7 +156,7 @@ def write_mesh(export, path, mesh, slots, name, modifier=None):
     if modifier:
         usd.CreateInterpolateBoundaryAttr(BOUNDARY[modifier.boundary_smooth])
         usd.CreateFaceVaryingLinearInterpolationAttr(FACE_VARYING[modifier.uv_smooth])
-        edges, sharpness, vertices, vertex_sharpness = _creases(mesh, used, modifier.use_creases)
+        edges, sharpness, vertices, vertex_sharpness = _creases(mesh, used, modifier, export.is_animated)
         values |= {usd.CreateCreaseIndicesAttr(): edges.ravel(), usd.CreateCreaseSharpnessesAttr(): sharpness}
         values[usd.CreateCreaseLengthsAttr()] = np.full(len(edges), 2)
         values |= {usd.CreateCornerIndicesAttr(): vertices, usd.CreateCornerSharpnessesAttr(): vertex_sharpness}
@@ -201,13 +200,13 @@ def _bind(export, usd, faces, slots):
             warn(f'material "{name}" is left out, as no slot of an object has it')
 
 
-def _creases(mesh, used, use_creases):
+def _creases(mesh, used, modifier, may_move):
     # As Blender hands them to OpenSubdiv: the sharpness is ten times the square of the crease.
     edges = _values(mesh.edges, "vertices", np.int32, 2)
-    found = [mesh.attributes.get(f"crease_{domain}") if use_creases else None for domain in ("edge", "vert")]
-    creases = [each and _values(each.data, "value").astype(float) for each in found]
-    sharpness = np.zeros(len(edges)) if creases[0] is None else 10 * creases[0] ** 2
-    corners = np.zeros(len(mesh.vertices)) if creases[1] is None else 10 * creases[1] ** 2
+    found = [modifier.use_creases and mesh.attributes.get(f"crease_{domain}") for domain in ("edge", "vert")]
+    sharpness, corners = np.zeros(len(edges)), np.zeros(len(mesh.vertices))
+    for values, each in zip((sharpness, corners), found, strict=True):
+        values[:] = 10 * _values(each.data, "value", float) ** 2 if each else 0
     has_face = np.isin(np.arange(len(edges)), _values(mesh.loops, "edge_index", np.int32))
     # So that a plane with four creases keeps its corners: the last value that is assigned is the least.
     order = np.flatnonzero(has_face)[np.argsort(-sharpness[has_face], kind="stable")]
@@ -216,7 +215,9 @@ def _creases(mesh, used, use_creases):
     corners += np.where(valence == 2, least, 0)
     corners[edges[~has_face]] = INFINITE
     corners = np.minimum(corners[used], INFINITE)
-    sharp, creased = np.flatnonzero(corners > 0), has_face & (sharpness > 0)
+    # Arrays of another length at the next frame are not interpolated.
+    floor = -1 if may_move and any(found) else 0
+    sharp, creased = np.flatnonzero(corners > floor), has_face & (sharpness > floor)
     return np.searchsorted(used, edges[creased]), sharpness[creased], sharp, corners[sharp]
 
 
@@ -397,8 +398,7 @@ def _environment_turn(node):
 
 def _surface_node(owner):
     output = owner.node_tree.get_output_node("ALL") if owner.node_tree else None
-    source = _origin(output.inputs["Surface"]) if output else None
-    return source and source[0]
+    return (_origin(output.inputs["Surface"]) or [None])[0] if output else None
 
 
 def _origin(socket):

@@ -1,8 +1,8 @@
-"""A script for Blender: makes scenes. ``blender -b --python scenes.py -- KIND SCENE.blend OTHER`` also writes for the
+"""A script for Blender: makes scenes. ``blender -b --python scenes.py -- KIND SCENE.blend FACTS.json`` also writes:
 
-- ``model``: what Blender's own subdivision of it is;
-- ``look``: a picture by Cycles;
-- ``shown``: the points of each object in a render.
+- ``model``: what Blender's own subdivision of each object is;
+- ``shown``, ``look``, ``studio``, ``houses``: the names of the objects whose numbers are in the pixels of a picture by
+  Cycles, beside the scene, and of ``shown`` the points of each object in a render.
 """
 
 import itertools
@@ -43,6 +43,67 @@ def tree_of(owner):
     if bpy.app.version < (5, 0):
         owner.use_nodes = True
     return owner.node_tree
+
+
+def aim(name, kind, location=(0, 0, 0), rotation=(0, 0, 0), **values):
+    """Add the camera or a light."""
+    data = bpy.data.lights.new(name, kind) if kind else bpy.data.cameras.new(name)
+    thing = add(name, data, location, rotation)
+    if not kind:
+        bpy.context.scene.camera = thing
+    for key, value in values.items():
+        setattr(data, key, value)
+    return data
+
+
+def fill(node, inputs):
+    """Give inputs of a node values, or outputs of other nodes."""
+    for name, value in inputs.items():
+        socket = node.inputs[name.replace("_", " ") if isinstance(name, str) else name]
+        if isinstance(value, bpy.types.NodeSocket):
+            node.id_data.links.new(value, socket)
+        else:
+            socket.default_value = value
+
+
+def painted(mesh, name, **inputs):
+    """Nodes of a new material."""
+    mesh.materials.append(bpy.data.materials.new(name))
+    nodes = tree_of(mesh.materials[-1]).nodes
+    fill(nodes["Principled BSDF"], inputs)
+    return nodes
+
+
+def shoot(model, frame=1):
+    """Save the scene, and render it by Cycles."""
+    scene, layer = bpy.context.scene, bpy.context.view_layer
+    for number, name in enumerate(bpy.data.objects.keys(), 1):
+        bpy.data.objects[name].pass_index = number
+    render, image = scene.render, scene.render.image_settings
+    render.resolution_x, render.resolution_y, render.resolution_percentage = SIZE[0] * 2, SIZE[1] * 2, 50
+    render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", SAMPLES, False
+    scene.cycles.pixel_filter_type, layer.use_pass_object_index = "BOX", True
+    render.filepath = os.path.splitext(model)[0] + ".exr"
+    if bpy.app.version >= (5, 0):
+        image.media_type, image.use_exr_interleave = "MULTI_LAYER_IMAGE", True
+    image.file_format, image.color_depth = "OPEN_EXR_MULTILAYER", "32"
+    bpy.ops.wm.save_as_mainfile(filepath=model)
+    scene.frame_set(frame)
+    layer.update()
+    bpy.ops.render.render(write_still=True)
+    return bpy.data.objects.keys()
+
+
+def geometry_nodes(*kinds):
+    """A new group, and nodes in it, of which each is the input of the next one."""
+    group = bpy.data.node_groups.new("Nodes", "GeometryNodeTree")
+    for side in ("INPUT", "OUTPUT"):
+        group.interface.new_socket("Geometry", in_out=side, socket_type="NodeSocketGeometry")
+    kinds = (kind if kind.startswith("NodeGroup") else f"GeometryNode{kind}" for kind in (*kinds, "NodeGroupOutput"))
+    nodes = [*map(group.nodes.new, kinds)]
+    for node, after in itertools.pairwise(nodes):
+        group.links.new(node.outputs[0], after.inputs[0])
+    return group, *nodes
 
 
 def house():
@@ -90,32 +151,17 @@ def subdivided(thing):
 
 
 def dress(mesh):
-    """Materials, a camera and a light of each kind."""
+    """Materials of meshes and of an object."""
     for name, color in (("Red paint", (0.8, 0.1, 0.05, 1.0)), ("Gold", (0.9, 0.6, 0.2, 1.0))):
-        material = bpy.data.materials.new(name)
-        inputs = tree_of(material).nodes["Principled BSDF"].inputs
-        inputs["Base Color"].default_value = color
-        inputs["Metallic"].default_value = float(name == "Gold")
-        mesh.materials.append(material)
-    mesh.polygons[10].material_index = 1
+        painted(mesh, name, Base_Color=color, Metallic=float(name == "Gold"))
+    mesh.polygons[10].material_index, material = 1, mesh.materials[1]
     bpy.data.objects["Ground"].data.materials.append(material)
     slot = bpy.data.objects["no_creases"].material_slots[0]
     slot.link, slot.material = "OBJECT", material
-    things = {"Camera": bpy.data.cameras.new("Camera")}
-    for kind in ("SUN", "AREA", "POINT", "SPOT"):
-        things[kind] = bpy.data.lights.new(kind, kind)
-        things[kind].energy = 100.0
-    things["Camera"].lens = 80.0
-    for number, (name, data) in enumerate(things.items()):
-        add(name, data, (0.0, -8.0, 3.0 + number), (1.2, 0.0, 0.0))
-    bpy.context.scene.camera = bpy.data.objects["Camera"]
-    bpy.context.scene.world = bpy.data.worlds.new("World")
-    background = tree_of(bpy.context.scene.world).nodes["Background"]
-    background.inputs["Color"].default_value = (0.1, 0.2, 0.3, 1.0)
 
 
-def make_model(model, answers):
-    """All that an export has to place, and in answers what Blender's own subdivision of each object is."""
+def make_model(model):
+    """All that an export has to place, and what Blender's own subdivision of each object is."""
     mesh, compared = house(), ["no_creases", "mirrored"]
     for boundary, uv_rule in itertools.product(BOUNDARIES, UV_RULES):
         compared.append(f"{boundary}_{uv_rule}")
@@ -143,17 +189,20 @@ def make_model(model, answers):
     add("Smooth", smooth)
     dress(mesh)
     bpy.ops.wm.save_as_mainfile(filepath=model)
-    with open(answers, "w") as file:
-        json.dump({name: subdivided(bpy.data.objects[name]) for name in compared}, file)
+    return {name: subdivided(bpy.data.objects[name]) for name in compared}
 
 
-def make_shown(model, points):
+def make_shown(model):
     """What a viewport shows otherwise than a render, with an animation of three frames, and its points in a render."""
-    scene, nodes = bpy.context.scene, bpy.data.node_groups.new("Nodes", "GeometryNodeTree")
+    scene = bpy.context.scene
     scene.frame_end, scene.render.use_simplify, scene.render.simplify_subdivision = 3, True, 0
 
+    def place():
+        row, column = divmod(len(bpy.data.objects), 6)
+        return 4 * column - 10, 0, 4 * row - 6
+
     def cube(name, *modifiers, parts=None):
-        thing = add(name, bpy.data.meshes.new(name), (2.5 * len(bpy.data.objects), 0, 0))
+        thing = add(name, bpy.data.meshes.new(name), place())
         thing.data.from_pydata(CORNERS, [], SQUARES)
         if parts:
             scene.collection.objects.unlink(thing)
@@ -165,41 +214,38 @@ def make_shown(model, points):
     hidden.hide_render = True
     cube("absent", parts=hidden)
     part, subdivision = cube("part", "SUBSURF", parts=parts)
-    subdivision.render_levels = 2
+    subdivision.render_levels, part.location = 2, (0, 0, 0)
     cube("unseen")[0].hide_viewport = True
     _, screw = cube("screw", "SCREW")
     screw.steps, screw.render_steps = 3, 9
     for name, kind in (("curve", "CURVE"), ("wire", "CURVE"), ("text", "FONT")):
         curve = bpy.data.curves.new(name, kind)
-        curve.resolution_u, curve.render_resolution_u, curve.bevel_depth = 2, 5, 0.1
+        curve.resolution_u, curve.render_resolution_u, curve.bevel_depth = 2, 5, 0.3
         if kind == "FONT":
             curve.body = "o"
         else:
             curve.splines.new("BEZIER").bezier_points.add(1)
-            curve.splines[0].bezier_points[1].co = curve.splines[0].bezier_points[1].handle_left = (1, 1, 0)
-        add(name, curve, (0, 3, 0))
+            curve.splines[0].bezier_points[1].co = curve.splines[0].bezier_points[1].handle_left = (2, 0, 1)
+        add(name, curve, place())
     bpy.data.objects["wire"].modifiers.new("Subdivision", "SUBSURF")
-    bpy.ops.surface.primitive_nurbs_surface_sphere_add(location=(0, 6, 0))
+    bpy.ops.surface.primitive_nurbs_surface_sphere_add(location=place())
     bpy.context.object.name = "spline"
     balls = bpy.data.metaballs.new("balls")
     balls.elements.new()
-    add("balls", balls, (3, 6, 0))
-    holder = add("holder", None, (0, 9, 0))
+    add("balls", balls, place())
+    holder = add("holder", None, place())
     holder.instance_type, holder.instance_collection = "COLLECTION", parts
     frame = cube("frame")[0]
     frame.instance_type, frame.show_instancer_for_render = "VERTS", False
-    cube("child")[0].parent = frame
+    child = cube("child")[0]
+    child.parent, child.location, child.scale = frame, (0, 0, 0), (0.5, 0.5, 0.5)
     hairs = cube("emitter", "PARTICLE_SYSTEM")[1].particle_system.settings
     hairs.type, hairs.count, hairs.render_type, hairs.instance_object = "HAIR", 5, "OBJECT", part
     # Geometry nodes that instance a cube at three points of a line.
-    nodes.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
-    kinds = "GeometryNodeMeshCube", "GeometryNodeMeshLine", "GeometryNodeInstanceOnPoints", "NodeGroupOutput"
-    box, line, on_points, end = map(nodes.nodes.new, kinds)
+    group, line, on_points, _ = geometry_nodes("MeshLine", "InstanceOnPoints")
     line.inputs["Count"].default_value = 3
-    nodes.links.new(line.outputs[0], on_points.inputs["Points"])
-    nodes.links.new(box.outputs["Mesh"], on_points.inputs["Instance"])
-    nodes.links.new(on_points.outputs[0], end.inputs[0])
-    cube("nodes", "NODES")[1].node_group = nodes
+    group.links.new(group.nodes.new("GeometryNodeMeshCube").outputs["Mesh"], on_points.inputs["Instance"])
+    cube("nodes", "NODES")[1].node_group = group
     cube("thick", "SUBSURF", "SOLIDIFY")
     # What moves.
     key, _ = cube("key", "SUBSURF")
@@ -207,19 +253,34 @@ def make_shown(model, points):
     shape = key.shape_key_add(name="Larger")
     for point in shape.data:
         point.co = 2 * point.co
-    camera, sun = bpy.data.cameras.new("Camera"), bpy.data.lights.new("Sun", "SUN")
-    camera.type, scene.camera = "ORTHO", add("Camera", camera, (0, -30, 0), (math.pi / 2, 0, 0))
-    sun.angle, scene.render.use_motion_blur, scene.render.motion_blur_shutter = 0.01, True, 0.5
-    add("Sun", sun).scale = (2, 2, 2)
+    rigged, bend, _ = cube("rigged", "ARMATURE", "SUBSURF")
+    rigged.vertex_groups.new(name="Bone").add([1, 3, 5, 7], 1, "REPLACE")
+    rig = bpy.context.view_layer.objects.active = bend.object = add(
+        "rig", bpy.data.armatures.new("Rig"), rigged.location
+    )
+    bpy.ops.object.mode_set(mode="EDIT")
+    rig.data.edit_bones.new("Bone").tail = (0, 0, 1)
+    bpy.ops.object.mode_set(mode="OBJECT")
+    bone = rig.pose.bones["Bone"]
+    bone.rotation_mode = "XYZ"
+    group, _, store, _ = geometry_nodes("NodeGroupInput", "StoreNamedAttribute")
+    store.domain, store.inputs["Name"].default_value = "EDGE", "crease_edge"
+    cube("creased", "NODES", "SUBSURF")[1].node_group = group
+    camera = aim("Camera", None, (0, -30, 0), (math.pi / 2, 0, 0), type="ORTHO")
+    sun = aim("Sun", "SUN", rotation=(0.9, 0.3, 0), angle=0.01)
+    scene.render.use_motion_blur, scene.render.motion_blur_shutter = True, 0.5
+    bpy.data.objects["Sun"].scale = (2, 2, 2)
     for owner, name, values in (
-        (shape, "value", (0.0, 1.0)), (camera, "ortho_scale", (40.0, 60.0)), (sun, "energy", (1.0, 3.0)),
-        (holder, "location", ((0, 9, 0), (0, 9, 4))),
+        (shape, "value", (0.0, 1.0)), (camera, "ortho_scale", (25.0, 25.1)), (sun, "energy", (1.0, 3.0)),
+        (holder, "scale", ((1, 1, 1), (1, 1, 1.5))), (bone, "rotation_euler", ((0, 0, 0), (0.8, 0, 0))),
+        (store.inputs["Value"], "default_value", (0.0, 0.9)),
     ):  # fmt: skip
         for frame, value in zip((1, 3), values, strict=True):
             setattr(owner, name, value)
             owner.keyframe_insert(name, frame=frame)
     scene.frame_set(1)
-    bpy.ops.wm.save_as_mainfile(filepath=model)
+    names = shoot(model, frame=2)
+    scene.frame_set(1)
     found = {}
 
     class Seen(bpy.types.USDHook):
@@ -239,14 +300,14 @@ def make_shown(model, points):
     bpy.utils.register_class(Seen)
     bpy.ops.wm.usd_export(filepath=model + ".usda", evaluation_mode="RENDER")
     bpy.utils.unregister_class(Seen)
-    with open(points, "w") as file:
-        json.dump(found, file)
+    return names, found
 
 
 TEXELS = 32
 COLUMNS, DISTANCE = 4, 2.2
+DULL, SHINY = ({"Roughness": roughness, "Specular_IOR_Level": level} for roughness, level in ((1.0, 0.0), (0.5, 0.5)))
 SIZE = (96, 72)
-SAMPLES = 256
+SAMPLES = 128
 
 
 def image(name, value, folder, *, is_data=False, is_float=False, is_packed=False):
@@ -270,158 +331,171 @@ def image(name, value, folder, *, is_data=False, is_float=False, is_packed=False
 
 
 class Tile:
-    """A square of one material, which its builder changes."""
+    """A square of one material, or another mesh in its place; without reflections, unless it asks for them."""
 
     count = 0
 
-    def __init__(self, **values):
+    def __init__(self, mesh=None, **inputs):
         self.number = Tile.count
         Tile.count += 1
-        mesh = bpy.data.meshes.new(f"tile_{self.number}")
-        mesh.from_pydata([(-1, 0, -1), (1, 0, -1), (1, 0, 1), (-1, 0, 1)], [], [(0, 1, 2, 3)])
-        for name, size in (("Main", 1.0), ("Second", 2.0)):
-            for corner, place in zip(mesh.uv_layers.new(name=name).data, [(0, 0), (1, 0), (1, 1), (0, 1)], strict=True):
-                corner.uv = [size * x for x in place]
+        if mesh is None:
+            mesh = bpy.data.meshes.new(f"tile_{self.number}")
+            mesh.from_pydata([(-1, 0, -1), (1, 0, -1), (1, 0, 1), (-1, 0, 1)], [], [(0, 1, 2, 3)])
+            mesh.uv_layers.new(name="Main")
+            for corner in mesh.uv_layers.new(name="Second").data:
+                corner.uv *= 2
         row, column = divmod(self.number, COLUMNS)
-        add(mesh.name, mesh, (DISTANCE * (column - 1.5), 0, DISTANCE * (1 - row)))
-        material = bpy.data.materials.new(f"paint_{self.number}")
-        mesh.materials.append(material)
-        self.tree = tree_of(material)
-        self.surface = self.tree.nodes["Principled BSDF"]
-        for name, value in values.items():
-            self.surface.inputs[name.replace("_", " ")].default_value = value
+        self.thing = add(mesh.name, mesh, (DISTANCE * (column - 1.5), 0, DISTANCE * (1 - row)))
+        self.nodes = painted(mesh, f"paint_{self.number}", **{**DULL, **inputs})
 
-    def node(self, kind, **values):
-        node = self.tree.nodes.new(kind)
+    def node(self, kind, inputs=(), **values):
+        """Outputs of a new node."""
+        node = self.nodes.new(f"ShaderNode{kind}")
         for name, value in values.items():
             setattr(node, name, value)
-        return node
-
-    def picture(self, image, coordinates=None, **values):
-        node = self.node("ShaderNodeTexImage", image=image, **values)
-        if coordinates:
-            self.tree.links.new(coordinates, node.inputs["Vector"])
+        fill(node, dict(inputs))
         return node.outputs
 
-    def color(self, image, coordinates=None, **values):
-        self.set("Base Color", self.picture(image, coordinates, **values)["Color"])
-        return self
+    def picture(self, image, coordinates=None, **values):
+        return self.node("TexImage", {"Vector": coordinates} if coordinates else {}, image=image, **values)
 
-    def set(self, name, output):
-        self.tree.links.new(output, self.surface.inputs[name])
+    def set(self, **inputs):
+        fill(self.nodes["Principled BSDF"], inputs)
 
-
-def mapping(tree, output, location=(0, 0, 0), rotation=(0, 0, 0), scale=(1, 1, 1)):
-    node = tree.nodes.new("ShaderNodeMapping")
-    for name, value in (("Location", location), ("Rotation", rotation), ("Scale", scale)):
-        node.inputs[name].default_value = value
-    tree.links.new(output, node.inputs["Vector"])
-    return node.outputs["Vector"]
+    def show(self, surface):
+        fill(self.nodes["Material Output"], {"Surface": surface})
 
 
 def tiles(folder):
     ramp = image("ramp", lambda u, v: (u, v, 0.3), folder)
-    stripes = image("stripes", lambda u, v: (0.8 * (u * 4 % 1 > 0.5), 0.6 * (v * 4 % 1 > 0.5), 0.2), "", is_packed=True)
+    stripes = image("stripes", lambda u, v: (0.8 * (u > 0.3), 0.6 * (v > 0.6), 0.2), "", is_packed=True)
     leaf = image("leaf", lambda u, v: (0.2, 0.7, 0.1, float(math.hypot(u - 0.5, v - 0.5) < 0.4)), folder)
     packed = image("packed", lambda u, v: (1.0, 0.2 + 0.7 * u, float(v > 0.5)), folder, is_data=True)
     glow = image("glow", lambda u, v: (float(u > 0.5), 0.5 * (v > 0.5), 0.2), folder)
     dents = image(
         "dents", lambda u, v: (0.5 + 0.3 * math.sin(12 * u), 0.5 + 0.3 * math.cos(12 * v), 0.9), folder, is_data=True
     )
-    Tile().color(ramp)
     tile = Tile()
-    texcoord = tile.node("ShaderNodeTexCoord").outputs["UV"]
-    tile.color(ramp, mapping(tile.tree, texcoord, (0.2, 0.1, 0), (0, 0, 0.5), (2, 1.5, 1)), extension="MIRROR")
-    Tile().color(stripes)
-    tile = Tile().color(leaf)
-    tile.set("Alpha", tile.surface.inputs["Base Color"].links[0].from_node.outputs["Alpha"])
+    tile.set(Base_Color=tile.picture(ramp)["Color"])
     tile = Tile()
-    channels = tile.node("ShaderNodeSeparateColor")
-    tile.tree.links.new(tile.picture(packed)["Color"], channels.inputs[0])
-    tile.set("Roughness", channels.outputs["Green"])
-    tile.set("Metallic", channels.outputs["Blue"])
+    moved = {"Vector": tile.node("TexCoord")["UV"], "Location": (0.2, 0.1, 0), "Rotation": (0, 0, 0.5)}
+    moved = tile.node("Mapping", {**moved, "Scale": (2, 1.5, 1)})["Vector"]
+    tile.set(Base_Color=tile.picture(ramp, moved, extension="MIRROR")["Color"])
+    tile = Tile()
+    tile.set(Base_Color=tile.picture(stripes)["Color"])
+    tile = Tile()
+    picture = tile.picture(leaf)
+    tile.set(Base_Color=picture["Color"], Alpha=picture["Alpha"])
+    tile = Tile(**SHINY)
+    channels = tile.node("SeparateColor", {0: tile.picture(packed)["Color"]})
+    tile.set(Roughness=channels["Green"], Metallic=channels["Blue"])
     tile = Tile(Emission_Strength=2.0, Base_Color=(0.1, 0.1, 0.1, 1.0))
-    tile.set("Emission Color", tile.picture(glow)["Color"])
+    tile.set(Emission_Color=tile.picture(glow)["Color"])
     tile = Tile()
-    turned = tile.node("ShaderNodeNormalMap")
-    turned.inputs["Strength"].default_value = 0.7
-    tile.tree.links.new(tile.picture(dents)["Color"], turned.inputs["Color"])
-    tile.set("Normal", turned.outputs["Normal"])
+    tile.set(Normal=tile.node("NormalMap", {"Strength": 0.7, "Color": tile.picture(dents)["Color"]})["Normal"])
     tile = Tile()
-    product = tile.node("ShaderNodeMix", data_type="RGBA", blend_type="MULTIPLY")
-    product.inputs[0].default_value, product.inputs[7].default_value = 1.0, (0.9, 0.4, 0.6, 1.0)
-    picture = tile.picture(ramp, tile.node("ShaderNodeUVMap", uv_map="Second").outputs["UV"])
-    tile.tree.links.new(picture["Color"], product.inputs[6])
-    tile.set("Base Color", product.outputs[2])
+    second = {0: 1.0, 6: tile.picture(ramp, tile.node("UVMap", uv_map="Second")["UV"])["Color"], 7: (0.9, 0.4, 0.6, 1)}
+    tile.set(Base_Color=tile.node("Mix", second, data_type="RGBA", blend_type="MULTIPLY")[2])
     Tile(Alpha=0.5, Base_Color=(0.9, 0.2, 0.1, 1.0))
     tile = Tile()
-    tile.color(ramp, tile.node("ShaderNodeUVMap", uv_map="Main").outputs["UV"])
+    tile.set(Base_Color=tile.picture(ramp, tile.node("UVMap", uv_map="Main")["UV"])["Color"])
     tile = Tile()
-    colors = bpy.data.meshes[f"tile_{tile.number}"].color_attributes.new("Tint", "FLOAT_COLOR", "POINT").data
+    colors = tile.thing.data.color_attributes.new("Tint", "FLOAT_COLOR", "POINT").data
     colors.foreach_set("color", [1.0, 0.2, 0.1, 1.0] * 2 + [0.2, 0.5, 1.0, 1.0] * 2)
-    tile.set("Base Color", tile.node("ShaderNodeVertexColor", layer_name="Tint").outputs["Color"])
+    tile.set(Base_Color=tile.node("VertexColor", layer_name="Tint")["Color"])
     tile = Tile()
-    emission = tile.node("ShaderNodeEmission")
-    emission.inputs["Color"].default_value = (0.2, 0.6, 0.1, 1.0)
-    tile.tree.links.new(emission.outputs[0], tile.tree.nodes["Material Output"].inputs["Surface"])
+    tile.show(tile.node("Emission", {"Color": (0.2, 0.6, 0.1, 1.0)})[0])
 
 
 def what_is_left_out():
     """A tile behind the camera with all that has no place in the file."""
     tile = Tile()
-    thing = bpy.data.objects[f"tile_{tile.number}"]
-    thing.location, thing.visible_shadow = (0, -30, 0), False
-    tile.tree.links.new(
-        tile.node("ShaderNodeBsdfGlass").outputs[0], tile.tree.nodes["Material Output"].inputs["Surface"]
-    )
-    lamp = bpy.data.lights.new("Lamp", "AREA")
-    lamp.spread, lamp.energy = 1.0, 0.0
-    add("Lamp", lamp)
+    tile.thing.location, tile.thing.visible_shadow = (0, -30, 0), False
+    tile.show(tile.node("BsdfGlass")[0])
+    aim("Lamp", "AREA", spread=1.0, energy=0.0)
 
 
 def sky(folder):
-    world = bpy.data.worlds.new("World")
-    bpy.context.scene.world = world
-    tree = tree_of(world)
-    picture = tree.nodes.new("ShaderNodeTexEnvironment")
+    world = bpy.context.scene.world = bpy.data.worlds.new("World")
+    nodes = tree_of(world).nodes
+    picture, turn, directions = (nodes.new(f"ShaderNode{kind}") for kind in ("TexEnvironment", "Mapping", "TexCoord"))
 
     def light(u, v):
         return 0.2 + (abs(u - 0.5) < 0.1), 0.3 + 0.5 * (v > 0.5) + (abs(u - 0.75) < 0.05), 0.5 + 0.5 * v
 
     picture.image = image("sky", light, folder, is_data=True, is_float=True)
-    directions = tree.nodes.new("ShaderNodeTexCoord").outputs["Generated"]
-    tree.links.new(mapping(tree, directions, rotation=(0.2, 0.1, 0.9)), picture.inputs["Vector"])
-    background = tree.nodes["Background"]
-    tree.links.new(picture.outputs["Color"], background.inputs["Color"])
-    background.inputs["Strength"].default_value = 0.6
+    fill(turn, {"Vector": directions.outputs["Generated"], "Rotation": (0.2, 0.1, 0.9)})
+    fill(picture, {"Vector": turn.outputs["Vector"]})
+    fill(nodes["Background"], {"Color": picture.outputs["Color"], "Strength": 0.6})
 
 
-def make_look(model, picture):
-    """Tiles of materials that read images, and their picture by Cycles."""
-    scene, folder = bpy.context.scene, os.path.dirname(model)
-    tiles(folder)
+def make_look(model):
+    """Tiles of materials that read images, depth of field and a shift."""
+    tiles(os.path.dirname(model))
     what_is_left_out()
-    sky(folder)
-    sun = bpy.data.lights.new("Sun", "SUN")
-    sun.energy, sun.angle = 1.5, 0.005
-    add("Sun", sun, rotation=(1.0, 0.3, 0))
-    spot = bpy.data.lights.new("Spot", "SPOT")
-    spot.energy, spot.spot_size, spot.spot_blend, spot.shadow_soft_size = 400.0, 0.7, 0.6, 0.0
-    add("Spot", spot, (-3, -10, 0), (math.pi / 2, 0, 0))
-    camera = bpy.data.cameras.new("Camera")
-    camera.lens, camera.shift_x, camera.shift_y = 40.0, 0.05, -0.02
-    camera.dof.use_dof, camera.dof.focus_distance, camera.dof.aperture_fstop = True, 12.0, 0.5
-    scene.camera = add("Camera", camera, (0, -12, 0), (math.pi / 2, 0, 0))
-    render = scene.render
-    render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", SAMPLES, False
-    render.resolution_x, render.resolution_y, render.resolution_percentage = SIZE[0] * 2, SIZE[1] * 2, 50
-    render.image_settings.file_format, render.image_settings.color_depth = "OPEN_EXR", "32"
-    render.filepath = picture
-    bpy.ops.render.render(write_still=True)
-    bpy.ops.wm.save_as_mainfile(filepath=model)
+    sky(os.path.dirname(model))
+    aim("Sun", "SUN", rotation=(1.0, 0.3, 0), energy=1.5, angle=0.005)
+    cone = {"spot_size": 0.7, "spot_blend": 0.6, "shadow_soft_size": 0.0}
+    aim("Spot", "SPOT", (-3, -10, 0), (math.pi / 2, 0, 0), energy=400.0, **cone)
+    lens = aim("Camera", None, (0, -12, 0), (math.pi / 2, 0, 0), lens=40.0, shift_x=0.0625, shift_y=-0.03125).dof
+    lens.use_dof, lens.focus_distance, lens.aperture_fstop = True, 12.0, 0.5
+    return shoot(model), {}
+
+
+def make_studio(model):
+    """Cages of many materials in front of a wall, and a crop without the background."""
+    render, red = bpy.context.scene.render, (0.8, 0.1, 0.05, 1.0)
+    waves = image("waves", lambda u, v: [0.5 + 0.5 * math.sin(20 * u * v)] * 3, os.path.dirname(model), is_data=True)
+
+    def block(**inputs):
+        mesh = bpy.data.meshes.new(f"block_{Tile.count}")
+        mesh.from_pydata(CORNERS, [], SQUARES)
+        mesh.uv_layers.new()
+        tile = Tile(mesh, **inputs)
+        subdivide(tile.thing)
+        return tile
+
+    block(**SHINY)
+    block(Base_Color=red)
+    block(**SHINY, Coat_Weight=1.0, Base_Color=red)
+    block(Metallic=1.0, Roughness=0.3, Specular_IOR_Level=0.5, Base_Color=(0.9, 0.6, 0.2, 1.0))
+    tile = block()
+    tile.set(Normal=tile.node("Bump", {"Distance": 0.1, "Height": tile.picture(waves)["Color"]})["Normal"])
+    tile, color = block(), (0.1, 0.2, 0.7, 1.0)
+    mixed = {0: tile.node("Value")[0], 6: red, 7: tile.node("RGB")[0]}
+    for socket, value in ((mixed[0], 0.3), (mixed[7], color)):
+        socket.default_value = value
+    tile.set(Base_Color=tile.node("Mix", mixed, data_type="RGBA")[2])
+    tile = block()
+    tile.show(tile.node("BsdfDiffuse")[0])
+    tile = Tile(Base_Color=(0.5, 0.5, 0.5, 1.0))
+    tile.thing.location, tile.thing.scale = (0, 1.5, 0), (8, 1, 6)
+    world = bpy.context.scene.world = bpy.data.worlds.new("World")
+    fill(tree_of(world).nodes["Background"], {"Color": (0.1, 0.2, 0.3, 1.0), "Strength": 0.5})
+    aim("Area", "AREA", (-4, -5, 4), (0.9, 0, -0.7), energy=400.0, shape="RECTANGLE", size=2.0, size_y=1.0)
+    aim("Point", "POINT", (5, -4, -1), energy=150.0, shadow_soft_size=0.2, color=(1.0, 0.7, 0.4))
+    aim("Camera", None, (0, -12, 0), (math.pi / 2, 0, 0), lens=40.0)
+    render.film_transparent = render.use_border = render.use_crop_to_border = True
+    render.border_max_x, render.border_min_y, render.border_max_y = 0.9, 0.1, 1.0
+    return shoot(model), {}
+
+
+def make_houses(model):
+    """The cage with each rule of the modifier, and an image."""
+    tile = Tile(house())
+    tile.set(Base_Color=tile.picture(image("ramp", lambda u, v: (u, v, 0.3), os.path.dirname(model)))["Color"])
+    tile.thing.hide_render = True
+    for number, rules in enumerate(itertools.product(BOUNDARIES, UV_RULES)):
+        thing = add_subdivided("_".join(rules), tile.thing.data, boundary_smooth=rules[0], uv_smooth=rules[1])
+        thing.location, thing.rotation_euler = (4 * (number % 4) - 6, 0, 5 * (number // 4) - 6), (0.3, 0, 2.6)
+    sky(os.path.dirname(model))
+    aim("Camera", None, (0, -30, 0), (math.pi / 2, 0, 0), lens=55.0)
+    return shoot(model), {}
 
 
 if __name__ == "__main__":
-    kind, *paths = sys.argv[sys.argv.index("--") + 1 :]
+    kind, model, facts = sys.argv[sys.argv.index("--") + 1 :]
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    {"model": make_model, "look": make_look, "shown": make_shown}[kind](*paths)
+    found = globals()[f"make_{kind}"](model)
+    with open(facts, "w") as file:
+        json.dump(found, file)
