@@ -36,17 +36,7 @@ from .adaptive_grid import (
     tile_type,
     whole_patches,
 )
-from .criterion import (
-    Cone,
-    Criterion,
-    cone_around,
-    dot,
-    least_product,
-    normal_cone,
-    rounded_up,
-    tangent_cone,
-    unit,
-)
+from .criterion import Cone, Criterion, cone_around, dot, least_product, normal_cone, rounded_up, tangent_cone, unit
 from .memory import require_memory_for_triangles
 from .uniform import checked_rate
 from .vertex_table import VertexPolynomials, VertexRuns, VertexTable, vertex_polynomials
