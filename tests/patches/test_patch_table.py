@@ -42,9 +42,10 @@ def test_classes_group_patches_by_signature_and_one_ring(scheme, cage):
         assert len(set(table.is_whole[table.elements.face[patch_class.corners]])) == 1
         assert {*signatures_of(table, patch_class.corners)} == {patch_class.signature}
         ring = one_ring(patch_class.signature)
-        assert patch_class.controls.shape == (len(patch_class.corners), ring.vertex_count)
+        of_class = table.controls_of(patch_class)
+        assert of_class.shape == (len(patch_class.corners), ring.vertex_count)
         half_edges = table.half_edge_of_corner[patch_class.corners]
-        for controls, half_edge in zip(patch_class.controls, half_edges, strict=True):
+        for controls, half_edge in zip(of_class, half_edges, strict=True):
             alone = RingTable(table.topology, [ring], np.array([half_edge]), np.array([1]))
             np.testing.assert_array_equal(controls, alone.vertices)
             assert controls[0] == table.topology.face_vertices[half_edge]
@@ -66,7 +67,7 @@ def test_patches_of_a_class_see_the_same_near_faces_of_large_fans(scheme):
     for patch_class in table.classes:
         assert {each.near() for each in signatures_of(table, patch_class.corners)} == {patch_class.signature}
         start, end = table.topology.border_neighbours(table.topology.face_vertices[patch_class.corners])
-        for controls, ends in zip(patch_class.controls, zip(start, end, strict=True), strict=True):
+        for controls, ends in zip(table.controls_of(patch_class), zip(start, end, strict=True), strict=True):
             assert {*ends} <= {*controls}
     assert_classes_differ(table)
     # Far from the ends of both fans there are three kinds of faces, and so three of each of their corners.

@@ -45,7 +45,7 @@ def tiles_of(surface, scheme, side=None):
     for group, element in zip(patches.classes, elements, strict=True):
         tile, rows = part_of_tile(element, np.eye(element.control_count))
         if not tile.is_piece:
-            values = points[group.controls]
+            values = points[patches.controls_of(group)]
             samples = np.tensordot(element_stencils(scheme, group.signature, uv)[0], values, axes=(1, 1))
             yield tile, np.einsum("kj,tjd->kdt", rows, values), samples
 

@@ -40,14 +40,10 @@ FEW_SAMPLES = 4
 PLANE_POWERS = np.array([(0, 0), (1, 0), (0, 1)])
 
 
-class _Node(NamedTuple):
-    """An element at one depth of the patch trees, with samples."""
-
-    tree: PatchTree
-    sample_count: int  # Samples are in increasing order at depth 0, and parent by parent below
-    # For each child that contains samples: its number, its index among the nodes of the next depth, and the indices of
-    # its samples among those of this node
-    children: list[tuple[int, int, IntArray]]
+# A node of the patch trees with samples: its tree; its number of samples, which are in increasing order at depth 0, and
+# parent by parent below; and for each child that contains samples its number, its index among the nodes of the next
+# depth, and the indices of its samples among those of this node.
+Node = tuple[PatchTree, int, list[tuple[int, int, IntArray]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,14 +75,14 @@ class LocatedSamples:
         self.path = np.zeros(len(uv), dtype=np.int64)
         # Number of each sample, counted through all `leaves`
         self.leaf_sample = np.zeros(len(uv), dtype=np.int64)
-        self._depths: list[list[_Node]] = []
+        self._depths: list[list[Node]] = []
         domain, uv, speed, leaf_turn = scheme.domain, uv.copy(), np.ones(len(uv)), corner.copy()
         in_leaves: dict[IrregularPatch | None, list[tuple[int, int, Piece, IntArray]]] = {}
         trees, samples = list(elements), list[IntArray]([np.empty(0, dtype=np.int64)] * len(elements))
         for number, in_element in _grouped(element):
             samples[number] = in_element
         for depth in range(MOST_DEPTH + 1):
-            nodes = [_Node(tree, len(in_tree), []) for tree, in_tree in zip(trees, samples, strict=True)]
+            nodes: list[Node] = [(tree, len(in_tree), []) for tree, in_tree in zip(trees, samples, strict=True)]
             self._depths.append(nodes)
             inner = []
             for number, (tree, in_tree) in enumerate(zip(trees, samples, strict=True)):
@@ -96,7 +92,7 @@ class LocatedSamples:
                     in_leaves.setdefault(tree.piece.patch, []).append((depth, number, tree.piece, in_tree))
                     leaf_turn[in_tree] = (corner[in_tree] + tree.turn) % domain.corner_count
                     self.path[in_tree] += 1 << 2 * depth
-            counts = [nodes[number].sample_count for number in inner]
+            counts = [len(samples[number]) for number in inner]
             if not sum(counts):
                 break
             divide(trees[number] for number in inner)
@@ -110,12 +106,12 @@ class LocatedSamples:
             self.path[in_inner] += child << 2 * depth
             in_children: dict[PatchTree, tuple[int, list[IntArray]]] = {}
             for key, at in _grouped(4 * np.repeat(np.arange(len(inner)), counts) + child):
-                parent, number, in_child = nodes[inner[key // 4]], key % 4, in_inner[at]
-                tree, _ = parent.tree.children[number]
+                (parent, _, children), number, in_child = nodes[inner[key // 4]], key % 4, in_inner[at]
+                tree, _ = parent.children[number]
                 index, in_parents = in_children.setdefault(tree, (len(in_children), []))
                 in_parents.append(in_child)
-                parent.children.append((number, index, at - begins[key // 4]))
-                speed[in_child] *= parent.tree.domains[number].matrix[0, 0]
+                children.append((number, index, at - begins[key // 4]))
+                speed[in_child] *= parent.domains[number].matrix[0, 0]
             trees, samples = [*in_children], [np.concatenate(in_parents) for _, in_parents in in_children.values()]
         else:
             raise not_isolated(scheme, trees[0].signature)
@@ -193,7 +189,7 @@ class LocatedSamples:
 
     def slices(self) -> Iterator[slice]:
         """Return the samples of each element."""
-        ends = np.cumsum([node.sample_count for node in self._depths[0]]).tolist()
+        ends = np.cumsum([count for _, count, _ in self._depths[0]]).tolist()
         return (slice(begin, end) for begin, end in pairwise([0, *ends]))
 
 

@@ -226,9 +226,7 @@ def require_types(prim: Usd.Prim, time: Usd.TimeCode) -> None:
 
 
 def local_to_world(
-    prim: Usd.Prim,
-    time_of: Callable[[Usd.Attribute], Usd.TimeCode],
-    known: dict[str, Gf.Matrix4d] | None = None,
+    prim: Usd.Prim, time_of: Callable[[Usd.Attribute], Usd.TimeCode], known: dict[str, Gf.Matrix4d] | None = None
 ) -> Gf.Matrix4d:
     """Transform of a prim to world space, for row vectors, with operations at their own times.
 

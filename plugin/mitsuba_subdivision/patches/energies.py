@@ -51,8 +51,7 @@ def energy_matrix(
     points = control_points if refinement is None else refinement @ control_points
     total = sparse.csr_array((len(points), len(points)))
     for patch_class in counted(table.classes, "Energies of patch classes"):
-        first, shape = patch_class.first_control, patch_class.controls.shape
-        class_controls = controls[first : first + patch_class.controls.size].reshape(shape[::-1]).T.astype(np.int32)
+        class_controls = table.controls_of(patch_class, controls).astype(np.int32)
         basis, weights = _basis_derivatives(table.scheme, patch_class.signature, density, order)
         run_length = max(1, CHUNK // (3 * basis[0].size))
         for entries in np.split(class_controls, range(run_length, len(class_controls), run_length)):

@@ -144,7 +144,7 @@ def stencil_matrices(
             # The distinct samples of a class are consecutive.
             bounds = ends[run[of_class.start] : run[of_class.stop - 1] + 2]
             samples = order[bounds[0] : bounds[-1]].astype(np.int32)
-            columns = control_of_vertex[patch_class.controls[patch[samples]]].astype(np.int32)
+            columns = control_of_vertex[patches.controls_of(patch_class)[patch[samples]]].astype(np.int32)
             rows = np.repeat(samples, columns.shape[1])
             repeated = np.repeat(weights, np.diff(bounds), axis=0)
             for matrix_entries, matrix_weights in zip(entries, repeated.swapaxes(0, 1), strict=False):

@@ -41,15 +41,8 @@ class PatchClass:
     # (p,) int32: the corner of the element at which each patch begins, a half-edge of `PatchTable.elements`
     corners: IndexArray
     control_count: int  # K
-    # Index of the first entry of `controls` in `PatchTable.controls`, where the rest follows, column by column
+    # Index in `PatchTable.controls` of the first control point; the others follow, column by column
     first_control: int
-    rings: RingTable
-
-    @property
-    def controls(self) -> IndexArray:
-        """``(p, K)`` 0-based mesh vertices of each patch's one-ring."""
-        end = self.first_control + self.control_count * len(self.corners)
-        return self.rings.vertices[self.first_control : end].reshape(self.control_count, -1).T
 
 
 class PatchTable:
@@ -101,12 +94,18 @@ class PatchTable:
         """The classes of all patches, in the order of their codes."""
         rings, corners = self.rings, np.split(self._patch_codes[0][self._order[0]], self._order[1])
         columns = self._signatures, corners, rings.vertex_counts.tolist(), rings.offsets[:-1].tolist()
-        return tuple(PatchClass(*row, rings) for row in zip(*columns, strict=True))
+        return tuple(PatchClass(*row) for row in zip(*columns, strict=True))
 
     @property
     def controls(self) -> IndexArray:
-        """`PatchClass.controls` of all classes, flat."""
+        """`controls_of` of all classes, flat."""
         return self.rings.vertices
+
+    def controls_of(self, patch_class: PatchClass, controls: IntArray | None = None) -> IntArray:
+        """``(p, K)`` 0-based mesh vertices of each patch's one-ring; or those of others in the order of `controls`."""
+        flat, first = self.controls if controls is None else controls, patch_class.first_control
+        end = first + patch_class.control_count * len(patch_class.corners)
+        return flat[first:end].reshape(patch_class.control_count, -1).T
 
     @cached_property
     def _signatures(self) -> list[Signature]:

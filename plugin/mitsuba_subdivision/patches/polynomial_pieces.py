@@ -181,7 +181,7 @@ class SurfacePieces:
         form, sizes = polynomial_basis(table.scheme), np.zeros((len(patches.elements.face_sizes), 3))
         regular, tips, known = [], dict[IrregularPatch, list[Tips]](), dict[PatchTree, FloatArray]()
         for patch_class, tree in counted(list(zip(table.classes, table.trees, strict=True)), "Pieces of patch classes"):
-            controls, corners = points[patch_class.controls], patches.places(patch_class)
+            controls, corners = points[table.controls_of(patch_class)], patches.places(patch_class)
             np.maximum.at(sizes, patches.elements.face[corners], np.abs(controls).max(axis=1))
             half_edge, matrices, offsets = _places(patches, corners, tree)
             rows = tree.coefficients(form.of_controls, known)

@@ -94,10 +94,7 @@ class LimitSurface:
     def patches(self) -> PatchTable:
         """The cage's patches, grouped by class; the same for all surfaces of the same topology, tags and rules.
 
-        Raises
-        ------
-        MemoryError
-            If a vertex or face has so high a valence that the weights around it do not fit into memory.
+        Raises CageError if a vertex or a face has too high a valence.
         """
 
         def make() -> PatchTable:
@@ -216,14 +213,8 @@ class LimitSurface:
     def channel(self, name: str) -> Channel:
         """The interpolation of an attribute, or of the texture coordinates ("texcoords"), over the elements.
 
-        Repeated calls return the same object.
-
-        Raises
-        ------
-        ValueError
-            If the cage has no such attribute.
-        SchemeError
-            If the scheme has no rules for it.
+        Repeated calls return the same object. Raises ValueError if the cage has no such attribute, and SchemeError if
+        the scheme has no rules for it.
         """
         if name not in self._channels:
             attributes = self._attributes
@@ -412,13 +403,7 @@ class LimitSurface:
         """Prepare evaluation anywhere on a device: all data that does not depend on the control points' positions.
 
         Surfaces of the same topology, tags and rules share the object while a surface that called this method exists.
-
-        Raises
-        ------
-        SchemeError
-            As `bounds`.
-        MemoryError
-            If the pieces of so many classes of patches do not fit into memory.
+        Raises SchemeError as `bounds`.
         """
         return self._pieces
 
@@ -566,10 +551,7 @@ class LimitSurface:
     ) -> tuple[AttributeLayout, dict[str, FloatArray]]:
         """Evaluate the cage's texture coordinates and attributes, or those named, at the vertices of a tessellation.
 
-        Raises
-        ------
-        SchemeError
-            If the scheme has no rules for one of them.
+        Raises SchemeError if the scheme has no rules for one of them.
         """
         channels = {name: self.channel(name) for name in (self.attribute_names if names is None else names)}
         return attribute_table(table, self.patches, channels)

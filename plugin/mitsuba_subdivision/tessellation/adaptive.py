@@ -36,17 +36,7 @@ from .adaptive_grid import (
     tile_type,
     whole_patches,
 )
-from .criterion import (
-    Cone,
-    Criterion,
-    cone_around,
-    dot,
-    least_product,
-    normal_cone,
-    rounded_up,
-    tangent_cone,
-    unit,
-)
+from .criterion import Cone, Criterion, cone_around, dot, least_product, normal_cone, rounded_up, tangent_cone, unit
 from .memory import require_memory_for_triangles
 from .uniform import checked_rate
 from .vertex_table import VertexPolynomials, VertexRuns, VertexTable, vertex_polynomials
@@ -142,8 +132,9 @@ def _whole_patches(patches: PatchTable, rates: TileRates, points: FloatArray) ->
     for patch_class, element in counted(pairs, "Tiles of patch classes"):
         identity = np.eye(element.control_count)
         kind, rows = part_of_tile(element, identity)
-        for begin in range(0, len(patch_class.controls), TILES_AT_ONCE):
-            controls = patch_class.controls[begin : begin + TILES_AT_ONCE].T
+        of_class = table.controls_of(patch_class)
+        for begin in range(0, len(of_class), TILES_AT_ONCE):
+            controls = of_class[begin : begin + TILES_AT_ONCE].T
             values = np.stack([axis.take(controls, mode="clip") for axis in coordinates], axis=1)
             block, tiles = tiles[: controls.shape[1]], tiles[controls.shape[1] :]
             yield Part(kind, block, values if rows is identity else times(rows, values))

@@ -198,7 +198,7 @@ def vertex_polynomials(
     # Without unused classes: at low rates, patches of other classes may evaluate all samples of a class. Sorted by the
     # size of one-rings.
     used = np.unique(runs.patch_class).tolist()
-    used.sort(key=lambda index: classes[index].controls.shape[1])
+    used.sort(key=lambda index: classes[index].control_count)
     used_index = np.empty(len(classes), dtype=np.int64)
     used_index[used] = np.arange(len(used))
     classes, uv = [classes[index] for index in used], [uv[index] for index in used]
@@ -221,7 +221,7 @@ def _of_form(
     powers: IntArray, classes: Sequence[PatchClass], polynomials: Polynomials, runs: VertexRuns
 ) -> VertexPolynomials:
     class_of_block = np.repeat(np.arange(len(classes)), [len(rows) for rows in polynomials.rows])
-    blocks = np.array([(patch_class.first_control, *patch_class.controls.shape) for patch_class in classes])
+    blocks = np.array([(c.first_control, len(c.corners), c.control_count) for c in classes])
     blocks = blocks[class_of_block]
     weights_by_size: dict[int, list[FloatArray]] = {}
     for rows in polynomials.rows:
