@@ -1,4 +1,4 @@
-"""Derivatives of what a shape computes from its parameters, which Dr.Jit forgets after each reverse-mode pass."""
+"""Derivatives through the computations of a shape, which Dr.Jit forgets after each reverse-mode pass."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .device_state import is_recording
 
 
 class BackwardPasses:
-    """Follows gradients to parameters of a shape, and warns when they cannot go on to what these were computed from.
+    """Follows gradients to parameters of a shape, and warns if they cannot reach the variables behind these.
 
     Dr.Jit forgets how a variable was computed once a gradient has passed through it. It processes variables from the
     newest to the oldest, and then keeps gradients of those alone that were not computed. So a probe, a variable older
@@ -25,7 +25,7 @@ class BackwardPasses:
 
     def __init__(
         self,
-        name: str,  # Of the shape, in messages
+        name: str,  # Name of the shape in messages
         parameters: str,  # Their names
         float_type: type,  # Flat Dr.Jit array
     ) -> None:
@@ -66,7 +66,7 @@ class BackwardPasses:
         self,
         gradients: Iterable[Any],  # Zero for shapes of scenes that are no longer used
     ) -> None:
-        """Warn if gradients have come to parameters, but not to the variables that they were computed from."""
+        """Warn if gradients have reached parameters, but not the variables that these depend on."""
         is_lost = self._is_lost and not is_recording()
         if is_lost and any(dr.any(gradient != 0, axis=None) for gradient in gradients):
             warn(

@@ -54,7 +54,7 @@ class ExactShading:
         self,
         variant: Variant,
         shape: mi.Mesh,  # Its current material is used at each hit; not kept alive
-        name: str,  # Of the cage, in messages
+        name: str,  # Name of the cage in messages
         kernel: SurfaceKernel,  # The surface in object space, relative to the centre of the placement
         channels: dict[str, ChannelKernel],  # See `channels_at_hits`
         placement: Placement,
@@ -62,7 +62,7 @@ class ExactShading:
     ) -> None:
         self._variant, self._name, self.kernel, self.channels = variant, name, kernel, channels
         self._shape: Callable[[], mi.Mesh | None] = weakref.ref(shape)
-        # Of normals, relative to those of the surface
+        # Sign of normals, relative to the surface's
         self._sign = -1.0 if shape.has_flipped_normals() else 1.0
         self._counts: IndexBuffer = dr.zeros(kernel.types.index, len(_KINDS))
         self._texcoords = channels.get(TEXCOORDS)
