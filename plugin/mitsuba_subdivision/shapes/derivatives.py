@@ -70,10 +70,9 @@ class BackwardPasses:
         is_lost = self._is_lost and not is_recording()
         if is_lost and any(dr.any(gradient != 0, axis=None) for gradient in gradients):
             warn(
-                f"{self._name}: gradients came to {self._parameters} a second time since the last update, and could "
-                "not go on to the variables that these were computed from, as Dr.Jit forgets a computation once "
-                "gradients have passed through it; assign the parameters and update before each view, or differentiate "
-                "one loss of all views, as loss_of_views computes it"
+                f"{self._name}: gradients reached {self._parameters} a second time since the last update, but not the "
+                "variables that these were computed from, as Dr.Jit forgets a computation after one backward pass; "
+                "assign and update the parameters before each view, or differentiate the sum of loss_of_views"
             )
 
     def _made(self) -> Any:

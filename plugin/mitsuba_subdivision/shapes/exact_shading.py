@@ -34,7 +34,7 @@ GRAZING = 1e-2
 SAME_PARAMETERS = 1e-3
 _NORMAL_DERIVATIVES = int(mi.RayFlags.dNSdUV) | int(mi.RayFlags.dNGdUV)
 _PARAMETERS = int(mi.RayFlags.UV) | int(mi.RayFlags.dPdUV) | _NORMAL_DERIVATIVES
-_KINDS = ("are on the ray", "are along the normal nearby", "are shaded where the triangle lies in the surface")
+_KINDS = ("are on the ray", "are along the normal", "are at the triangle's parameters")
 _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 
 # Number of fixed-point iterations of `ExactShading.hit_by_texcoords`. Each removes most of the difference between
