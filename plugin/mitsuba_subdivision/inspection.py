@@ -157,7 +157,7 @@ def _warnings(surface: LimitSurface) -> Iterator[str]:
         ripples = f"{triangles:,} of {cage.face_count:,} faces are triangles, on which Catmull-Clark ripples"
         yield f'{ripples}; Loop is made for them, and triangle_rule "smooth" helps'
     if low := np.count_nonzero(inner & (t.vertex_face_count == 2)):
-        yield f"{low:,} inner vertices have valence 2, where the surface has a normal but does not turn to it smoothly"
+        yield f"{low:,} inner vertices have valence 2, whose normals the surface does not approach smoothly"
     if (high := int(t.vertex_face_count[inner].max(initial=0))) > HIGH_VALENCE:
         yield f"the highest valence is {high}: the surface is pinched around it"
     if scheme.element == "face":

@@ -77,7 +77,7 @@ class Textures:
             return None
         if picture.pixels.dtype == np.uint8 and use.scale[:2] == [1.0, 1.0] and use.bias[:2] == [0.0, 0.0]:
             expected = "expected a scale of 2 and a bias of -1"
-            self._notes.add(f"normal maps of eight bits are normals from 0 to 1 as they are; {expected}", use.file)
+            self._notes.add(f"normal maps of eight bits are normals from 0 to 1 without a scale; {expected}", use.file)
         scale, bias, fallback = (np.array([use.scale, use.bias, use.fallback]) + np.array([[0], [1], [1]])) / 2
         use = replace(use, scale=scale.tolist(), bias=bias.tolist(), fallback=fallback.tolist())
         return self._bitmap(use, picture, is_raw=True)

@@ -225,7 +225,7 @@ PICTURE = np.zeros((SIZE, SIZE, 3))
         ({"views": [PICTURE * np.nan]}, "view 0: a picture with values that are not finite"),
         ({"masks": [np.ones((3, 3))]}, r"a mask of the shape \(3, 3\)"),
         ({"masks": [-np.ones((SIZE, SIZE))]}, "negative"),
-        ({"scene": {"surface": {"type": "sphere"}}}, 'scene has an entry "surface"; expected all but the surface'),
+        ({"scene": {"surface": {"type": "sphere"}}}, 'scene has an entry "surface"; expected another name'),
         ({"loss": "l3"}, 'loss "l3"; expected "l1", "l2" or a function'),
         ({"laplacian": "mesh"}, 'laplacian "mesh"; expected "cage" or "surface"'),
         ({"others": {"surface.colour": 0.1}}, 'others has "surface.colour"; expected one of .*surface.control_points'),

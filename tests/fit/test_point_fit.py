@@ -147,7 +147,7 @@ def test_malformed_points_are_refused(target, points, normals, message):
 
 def test_malformed_meshes_and_normals_to_the_inside_are_refused(target):
     points, positions = target.sample(50, 1), target.cage.positions
-    with pytest.raises(ValueError, match="expected normals to the outside"):
+    with pytest.raises(ValueError, match="expected outward normals"):
         PointFit(target.cage, points.p, -points.n, both_ways=False).step()
     with pytest.raises(ValueError, match=r"triangle 1 is \[0, 1, 30\]; expected vertices from 0 to 29"):
         to_mesh(target.cage, positions, [[0, 1, 2], [0, 1, 30]])

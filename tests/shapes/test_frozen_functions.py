@@ -131,5 +131,5 @@ def test_unsupported_updates_in_frozen_functions_are_errors():
     with pytest.raises(RuntimeError, match="a frozen function has read the triangles of this shape; choose others"):
         shape.retessellate()
     for key, value in (("chord_error", 0.2), ("to_world", mi.Transform4f().scale([-1, 1, 1]))):
-        with pytest.raises(RuntimeError, match="or load the scene anew"):
+        with pytest.raises(RuntimeError, match="or load the scene again"):
             update(parameters, {f"shape.{key}": value})

@@ -170,7 +170,7 @@ def test_lost_gradients_warn(name, displacement, told):
     assign()
     first = differentiate(0)
     assert first != 0
-    with pytest.warns(CageWarning, match=f"control cage: gradients came to {told} a second time since the last"):
+    with pytest.warns(CageWarning, match=f"control cage: gradients reached {told} a second time since the last"):
         assert differentiate(1) == first
     assign()
     second = differentiate(1)

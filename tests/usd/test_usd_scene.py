@@ -960,7 +960,7 @@ def test_ignored_properties_warn_once_by_name(scene, tmp_path, text, message, en
 @pytest.mark.parametrize("head", ["", 'renderSettingsPrimPath = "/none"'])
 def test_unreferenced_render_settings_warn(stage, head):
     path = stage(settings(RESOLUTION) + CAMERA + mesh("cube", CUBE), head=head)
-    with pytest.warns(CageWarning, match=r"render settings are those that .* all others are ignored \(/settings\)"):
+    with pytest.warns(CageWarning, match=r"only the render settings of .* all others are ignored \(/settings\)"):
         assert StageReader(path).at().picture.resolution is None
 
 

@@ -293,7 +293,7 @@ class ControlCage:
                 f"{self.source.name}: {len(validated)} new positions; expected {self.vertex_count}, one per vertex"
             )
         cage = type(self).__new__(type(self))
-        # Without what a derived class has cached.
+        # Without cached values of a derived class.
         vars(cage).update({item.name: getattr(self, item.name) for item in fields(self)}, positions=validated)
         return cage
 

@@ -90,7 +90,7 @@ def number_of_such(count: int, noun: str) -> str:
 class CageSource:
     """Origin of a control cage, which names it, its vertices and its faces in messages, from 0-based indices."""
 
-    name: str = "control cage"  # Of the whole cage; for a file, its quoted path
+    name: str = "control cage"  # Name of the cage; for a file, its quoted path
     index_base: int = 0  # Number of the first vertex and face in messages: 0 for arrays, 1 for OBJ files
     # (n_v,), (n_f,) int: 1-based line of each vertex and face in the file; None if the file has no lines
     vertex_lines: IntArray | None = None

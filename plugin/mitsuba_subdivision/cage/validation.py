@@ -68,7 +68,7 @@ def require_names(attributes: object, source: CageSource) -> None:
     if "texcoords" in attributes:
         raise CageError(
             f'{source.name}: an attribute is called "texcoords"; expected another name, as texture coordinates are '
-            "given apart from attributes"
+            "a separate argument"
         )
 
 
@@ -346,7 +346,7 @@ def validated_edges(topology: Topology, edges: ArrayLike, source: CageSource) ->
     is_first[np.unique(t.edge[half_edges], return_index=True)[1]] = True
     for holds, problem, expected in (
         (half_edges >= 0, "is no edge of a face", "edges of two faces"),
-        (t.twin[half_edges] >= 0, "is infinitely sharp, as it has not two faces", "edges of two faces"),
+        (t.twin[half_edges] >= 0, "is infinitely sharp, as it does not have two faces", "edges of two faces"),
         (is_first, "is given twice", "each edge once"),
     ):
         for row in np.flatnonzero(~holds)[:1]:

@@ -38,9 +38,9 @@ def compare(parser: CommandParser) -> None:
     default = f"default: {', '.join(DEFAULT_TIERS)} as far as images allow; flip if no other compares pixels"
     add("--tiers", metavar="TIERS", help=f"tiers to compare by, separated by commas ({default})")
     add("--spp", type=positive, metavar="N", help="samples per pixel of a scene (default: 256)")
-    add("--seed", type=seed, metavar="N", help="other samples of a scene for each N (default: 0)")
+    add("--seed", type=seed, metavar="N", help="seed of the samples of a scene (default: 0)")
     add_tolerances(parser, "tolerance to use instead of the reference's; can be repeated")
-    text = "effect of channels that only one image has: a file that gains a layer shows the same picture"
+    text = "effect of channels that only one image has"
     add("--missing-channels", choices=list(MISSING), default="warn", help=f"{text} (default: %(default)s)")
     add("--json", metavar="FILE", help='write the numbers as JSON; "-" is standard output')
     add("--html", type=Path, metavar="DIR", help="folder to write a report to")

@@ -115,13 +115,13 @@ def render(parser: CommandParser) -> None:
     add("--azimuth", type=finite, metavar="DEG", help="azimuth instead of --view: front 0, +x 90")
     add("--elevation", type=finite, metavar="DEG", help="elevation above the ground instead of --view, -90 to 90")
     add("--up", choices=UP_AXES, help="axis that points up (default: USD's own; OBJ: y; PLY: z)")
-    text = "pixels of the picture (default: 640x480, or as the stage or its camera asks for)"
+    text = "size in pixels (default: 640x480, or that of the stage or its camera)"
     add("--size", type=_size, metavar="WxH", help=text)
-    text = "pixels along the sides of a stage's textures at most (default: as many as the picture shows)"
+    text = "most pixels along a side of a stage's textures (default: as many as the picture shows)"
     add("--texture-size", type=positive, metavar="N", help=text)
-    add("--over", type=Path, metavar="FILE", help="USD layer that is stronger than a stage, to change it")
-    add("--camera", metavar="NAME", help="camera of a stage: its path, or its name (default: as the stage says)")
-    text = "picture that lights in place of all lights, such as sky.exr or sky.exr,turn=90,strength=2"
+    add("--over", type=Path, metavar="FILE", help="USD layer that changes a stage, stronger than its own layers")
+    add("--camera", metavar="NAME", help="camera of a stage: its path, or its name (default: the stage's)")
+    text = "environment map in place of all lights, such as sky.exr or sky.exr,turn=90,strength=2"
     add("--environment", type=_environment, metavar="FILE", help=text)
     add("--no-studio", action="store_true", help="without lights and backdrop of the studio")
     add("--transparent", action="store_true", help="with alpha, without a background")
@@ -133,7 +133,7 @@ def render(parser: CommandParser) -> None:
     text = "normals: interpolated between vertices, or exact (default: auto, exact where supported)"
     add("--shading", choices=SHADINGS, help=text)
     add("--save-scene", type=Path, metavar="FILE", help="also write the scene as XML, which can be edited and rendered")
-    text = "Frames are named NAME_0001.png and so on. Existing ones are kept, so that an interrupted command can go on."
+    text = "Frames are named NAME_0001.png and so on. Existing frames are kept: repeat a command to resume it."
     frames = parser.add_argument_group("frames of models", text)
     add = frames.add_argument
     add("--turntable", type=positive, metavar="N", help="turn the model around once, in N frames")
@@ -150,7 +150,7 @@ def render(parser: CommandParser) -> None:
     text = "The image is an OpenEXR file with the variance and the number of samples of each pixel."
     passes = parser.add_argument_group("rendering by passes", text)
     add = passes.add_argument
-    add("--pass", dest="share", type=_share, metavar="I/N", help='render only pass I of N; "merge" puts them together')
+    add("--pass", dest="share", type=_share, metavar="I/N", help='render only pass I of N; "merge" combines them')
     add("--passes", type=positive, metavar="N", help="render N passes one after the other, and merge")
     text = "render the passes, or the frames of a model, on the Dask cluster of this scheduler"
     add("--dask", metavar="ADDRESS", help=text)
@@ -167,7 +167,7 @@ def _render(options: argparse.Namespace) -> None:
     is_model = suffix in FORMATS
     if suffix in _OF_BLENDER:
         page = 'see the page "From Blender to a picture" of the guide, blender.md'
-        what = f'"{options.scene}" is a file for programs such as Blender, which write it as USD file'
+        what = f'"{options.scene}" is a file for programs such as Blender, which can convert it to USD'
         raise ValueError(f"{what}; expected a model ({', '.join(FORMATS)}): {page}")
     if not is_model and suffix != SCENE_SUFFIX and not options.scene.is_file():
         expected = f"a Mitsuba scene ({SCENE_SUFFIX}) or a model ({', '.join(FORMATS)})"
@@ -261,7 +261,7 @@ def _refuse_contradictions(options: argparse.Namespace, by_passes: bool) -> None
     if options.passes and has_frames:
         raise ValueError("--passes are of one picture; expected no --frames or --turntable beside it")
     if options.save_scene and (options.dask or options.passes):
-        raise ValueError("--save-scene writes a scene that is rendered at once; expected no --dask or --passes")
+        raise ValueError("--save-scene writes a scene that this process renders; expected no --dask or --passes")
     if options.time is not None and options.frames:
         raise ValueError("--time is one time, --frames are several; expected only one of them")
     if options.shutter and (options.turntable or (options.time is None and not options.frames)):

@@ -62,8 +62,8 @@ class Eigenbasis:
     def power_terms(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return left (K, t), right (t, K) and factors (count, t): ``T**n`` is ``left @ diag(factors[n]) @ right``.
 
-        The first K terms are those of the eigenvectors. What a block adds to the powers of its eigenvalue has the rank
-        of its Jordan blocks, which are few.
+        The first K terms are those of the eigenvectors. The addition of a block to the powers of its eigenvalue has the
+        rank of its Jordan blocks, which are few.
         """
         size, exponents = len(self.eigenvalues), np.arange(count)
         left: list[FloatArray] = [np.eye(size)]

@@ -222,7 +222,7 @@ def not_isolated(scheme: Scheme, rest: Signature) -> SchemeError:
     if rest.is_semi_sharp:
         return SchemeError(
             f"{scheme.name}: {MOST_DEPTH + 1} refinements leave something of a {rest.kind} semi-sharp; expected each "
-            "to take one from the sharpness"
+            "to decrease the sharpness by one"
         )
     return SchemeError(
         f"{scheme.name}: refinement leaves a {rest.kind} with fans {rest.fans} neither regular nor self-similar; "

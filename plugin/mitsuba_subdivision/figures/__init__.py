@@ -61,9 +61,9 @@ _FIGURES = (
     Figure("shading", "scenes", "brushed metal, shaded by vertices and exactly at every hit", ("spp",)),
     Figure("displacement", "scenes", "a jar before and after it is displaced, and its triangles", ("spp",)),
     Figure("zoom", "normal_error", "an extraordinary vertex, magnified up to a million times", ("spp",)),
-    Figure("zebra", "zebra", "reflection lines, with exact normals and with others", ("spp", "cage")),
+    Figure("zebra", "zebra", "reflection lines with exact normals, and by usual methods", ("spp", "cage")),
     Figure("curvature", "characteristic", "curvature around extraordinary vertices", ("cage",), has_numbers=True),
-    Figure("fit", "fit", "cages fitted to pictures, and how near they come", ("spp",)),
+    Figure("fit", "fit", "cages fitted to pictures, and their distance from the target", ("spp",)),
     Figure("hero", "scenes", "a human figure and its control cage", ("spp",)),
 )
 FIGURES = {figure.name: figure for figure in _FIGURES}

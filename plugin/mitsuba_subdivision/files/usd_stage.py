@@ -118,7 +118,7 @@ def _warn_of_no_effect(name: str, layer: Sdf.Layer, stage: Usd.Stage) -> None:
 
     layer.Traverse(layer.pseudoRoot.path, visit)
     if missing:
-        warn(f"{name}: there are no prims {_listed(sorted(missing), 3)}; expected some to change")
+        warn(f"{name}: there are no prims {_listed(sorted(missing), 3)} to change")
     if in_instances:
         parts = _listed(sorted(in_instances), 3)
         warn(f"{name}: {parts} are parts of instances, which USD shares; expected instanceable = false above them")

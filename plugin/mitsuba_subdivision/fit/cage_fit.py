@@ -178,13 +178,13 @@ class CageFit(Fit):
         if not views:
             raise ValueError("no views: expected one at least")
         if SHAPE in scene:
-            raise ValueError(f'scene has an entry "{SHAPE}"; expected all but the surface, which gets that name')
+            raise ValueError(f'scene has an entry "{SHAPE}"; expected another name, as the fitted surface has this one')
         if not callable(loss) and loss not in ("l1", "l2"):
             raise ValueError(f'loss "{loss}"; expected "l1", "l2" or a function of a picture and the index of its view')
         if laplacian not in ("cage", "surface"):
             raise ValueError(f'laplacian "{laplacian}"; expected "cage" or "surface"')
         if crease_of is not None and sharp_edges is None:
-            raise ValueError("crease_of without sharp_edges; expected both, as it is about these")
+            raise ValueError("crease_of without sharp_edges; expected both")
         self._shape = {**DEFAULT_SHAPE, **(shape or {}), **({} if scheme is None else {"scheme": scheme})}
         self._entries = {"type": "scene", "integrator": DEFAULT_INTEGRATOR, **scene}
         integrator = self._entries["integrator"]

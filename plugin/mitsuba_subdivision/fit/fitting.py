@@ -191,7 +191,7 @@ class Fit(ABC):
             raise ValueError(f'"{path}" is no checkpoint of a fit, or one of another version of this package')
         refinements, own = int(arrays["refinements"]), self.refinements
         if own > refinements:
-            raise ValueError(f'"{path}" was saved after {refinements} refinements; this fit has had {own} already')
+            raise ValueError(f'"{path}" was saved after {refinements} refinements; this fit has {own}')
         while self.refinements < refinements:
             self.refine()
         for name, values in self._state().items():

@@ -133,7 +133,7 @@ class PointFit(Fit):
             parts.append(self._paired(surface, samples, np.where(distance > self._near, nearest, -1)))
         weights, goals, across = zip(*parts, strict=True)
         if not sum(map(len, goals)):
-            raise ValueError("no point has a normal like that of the surface nearby; expected normals to the outside")
+            raise ValueError("no point has a normal on the side of the nearby surface's; expected outward normals")
         return sparse.csr_array(sparse.vstack(weights)), np.concatenate(goals), np.concatenate(across)
 
     def _paired(self, surface: LimitSurface, at: ClosestPoints | AreaSamples, goal: IntArray) -> Pairs:

@@ -146,7 +146,7 @@ class ArrayTypes:
             require_llvm()
         self.is_double = bool(dr.type_v(float_type) == dr.VarType.Float64)
         self.numpy_float: type = np.float64 if self.is_double else np.float32
-        # Of the difference of two points, relative to their coordinates: some units in the last place (ulp)
+        # Error of the difference of two points, relative to their coordinates: some units in the last place (ulp)
         self.rounding = 2.0**-50 if self.is_double else 2.0**-21
         arrays, suffix = sys.modules[float_type.__module__], "64" if self.is_double else ""
         self.float, self.index, self.index64 = float_type, arrays.UInt32, arrays.UInt64

@@ -83,7 +83,7 @@ class _Newton:
     # Sum of the steps
     u: Float
     v: Float
-    length: Float  # Of the last step
+    length: Float  # Length of the last step
     is_along_surface: Mask  # Lanes whose last step was along the surface, towards another hit of the line
     surface: PatchValues  # Before the last step, without second derivatives
 

@@ -344,7 +344,7 @@ def _piece_blocks(
 
 
 class ControlValues:
-    """What a linear map makes of the values of a cage, in one array that kernels gather from."""
+    """Result of a linear map of a cage's values, in one array for gathers of kernels."""
 
     # See `arrays_in`.
     UPLOADED_LATER = ("linear_map",)

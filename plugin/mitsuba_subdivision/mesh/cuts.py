@@ -297,7 +297,7 @@ def value_mesh(
     if topology is creased.topology and np.array_equal(rules, topology.vertex_rules):
         return topology, value_index
     cut = CutMesh(topology.with_rules(rules, None), vertex)
-    # Of two copies, each may be sharpened by the other. Three or more are corners in these modes.
+    # Each of two copies may sharpen the other. Three or more are corners in these modes.
     semi_sharpness = semi_sharpness_of_cut(mesh, cut, seam, differs, sharpens_smooth=mode in _CORNERS_PLUS)
     return cut.topology.with_rules(rules, semi_sharpness), value_index
 

@@ -6,8 +6,8 @@ half-edge, which also determines the corner with parameters (0, 0). A face eleme
 half-edge's face. The one-ring of a face is all faces that share a vertex with it. The one-ring of a vertex is all faces
 around it. The limit surface over an element depends on its one-ring only.
 
-A mesh may have millions of elements, but has few kinds of one-rings. So fans, of which a one-ring consists, also have
-integer codes (`fan_codes`), equal for equal fans, which whole-array operations compute for all half-edges of a mesh.
+A mesh may have millions of elements, but has few kinds of one-rings. So the fans of a one-ring also have integer codes
+(`fan_codes`), equal for equal fans, which whole-array operations compute for all half-edges of a mesh.
 """
 
 from __future__ import annotations

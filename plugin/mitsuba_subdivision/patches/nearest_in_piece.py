@@ -273,6 +273,6 @@ def _frames(du: FloatArray, dv: FloatArray) -> FloatArray:
         first = du / np.linalg.norm(du, axis=1, keepdims=True)
         frames = np.stack([first, np.cross(normal, first), normal], axis=1)
         error = np.abs(frames @ frames.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
-    # Written so that what is not a number is replaced, too.
+    # This form also replaces values that are not a number.
     frames[~(error < SQUARE)] = np.eye(3)
     return frames

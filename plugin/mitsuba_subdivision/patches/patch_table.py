@@ -121,7 +121,7 @@ class PatchTable:
         return RingTable(self.topology, one_rings(self._signatures), half_edges, self.patch_counts)
 
     def forget(self) -> None:
-        """Drop what is computed again on demand, for a mesh that nothing is evaluated on but kernels made of it."""
+        """Drop data that are computed again on demand, for a mesh that only its kernels evaluate."""
         refined = vars(self).get("refined")
         for part in (self, self.topology, *([] if refined is None else [refined.table, refined.table.topology])):
             for name in [name for name, value in vars(type(part)).items() if isinstance(value, cached_property)]:

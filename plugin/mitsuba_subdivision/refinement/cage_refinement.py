@@ -103,8 +103,8 @@ def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRe
     contents, refined = _with_tags(cage, contents, refinement, corners)
     if not np.array_equal(refined.is_hole, cage.is_hole[element]):
         raise CageError(
-            f'{cage.source.name}: boundary "{cage.boundary}" would make other holes of the refined cage, as a face has '
-            "an edge twice; expected none that does"
+            f'{cage.source.name}: boundary "{cage.boundary}" would give the refined cage other holes, as a face has '
+            "an edge twice; expected another boundary"
         )
     if cage.texcoords is not None or cage.attributes:
         attributes, value_meshes = refined_attributes(cage, scheme, refinement, matrix, corners)

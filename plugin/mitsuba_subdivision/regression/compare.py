@@ -132,7 +132,7 @@ def compare(
     """
     for image in (reference, test):
         if image.metadata.get("denoised"):
-            raise RegressionError(f'"{image.name}" is denoised, and its noise is needed; expected it as rendered')
+            raise RegressionError(f'"{image.name}" is denoised; expected the render with its noise')
     if (reference.size, reference.origin) != (test.size, test.origin):
         form = '"{}" has {} x {} pixels (display window from x = {}, y = {})'
         windows = " and ".join(form.format(image.name, *image.size, *image.origin) for image in (reference, test))
@@ -181,7 +181,7 @@ def _missing(reference: Image, test: Image, meaning: str) -> TierResult | None:
         lines += [f"only the {role} has {', '.join(only)}"] if only else []
     if lines and meaning == "warn" and "sampling" in reference.metadata and "channels" not in reference.metadata:
         status = Status.PASS  # Unchanged
-        lines.append("the reference is of an older version, which stored R, G, B: make it again to compare all")
+        lines.append("the reference is of an older version, which stored only R, G, B: make it again to compare all")
     return TierResult("channels", status, lines) if lines else None
 
 

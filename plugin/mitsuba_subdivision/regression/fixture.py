@@ -29,7 +29,7 @@ from .tiers import Status, Tolerances
 
 # Scenes of a reference, by its path: text of the scene, and the test that renders it.
 CLAIMS = pytest.StashKey[dict[Path, tuple[str, str]]]()
-TOO_LATE = "mitsuba was imported before mitsuba_subdivision, which would have found it an LLVM library;"
+TOO_LATE = "mitsuba was imported before mitsuba_subdivision, which chooses an LLVM library;"
 NAME = "expected another name=.. for one of them"
 _Settings = tuple[dict[str, str], int]  # Parameters of the scene's file, and index of its sensor
 

@@ -22,7 +22,7 @@ TIERS = {
     "probe": "what the rays through the centres of the pixels hit",
     "paired": "pixels from the same samples, which must be the same",
     "tile": "tiles of several sizes: does noise explain their difference?",
-    "flip": "converged pixels, as an eye sees them",
+    "flip": "converged images, by perception",
 }
 # Noise increases FLIP's errors, so this tier is only for images that no other tier can compare.
 DEFAULT_TIERS = ("probe", "paired", "tile")

@@ -1,4 +1,4 @@
-"""Derivatives of what a shape computes from its parameters, which Dr.Jit forgets after each reverse-mode pass."""
+"""Derivatives through the computations of a shape, which Dr.Jit forgets after each reverse-mode pass."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .device_state import is_recording
 
 
 class BackwardPasses:
-    """Follows gradients to parameters of a shape, and warns when they cannot go on to what these were computed from.
+    """Follows gradients to parameters of a shape, and warns if they cannot reach the variables behind these.
 
     Dr.Jit forgets how a variable was computed once a gradient has passed through it. It processes variables from the
     newest to the oldest, and then keeps gradients of those alone that were not computed. So a probe, a variable older
@@ -25,7 +25,7 @@ class BackwardPasses:
 
     def __init__(
         self,
-        name: str,  # Of the shape, in messages
+        name: str,  # Name of the shape in messages
         parameters: str,  # Their names
         float_type: type,  # Flat Dr.Jit array
     ) -> None:
@@ -66,14 +66,13 @@ class BackwardPasses:
         self,
         gradients: Iterable[Any],  # Zero for shapes of scenes that are no longer used
     ) -> None:
-        """Warn if gradients have come to parameters, but not to the variables that they were computed from."""
+        """Warn if gradients have reached parameters, but not the variables that these depend on."""
         is_lost = self._is_lost and not is_recording()
         if is_lost and any(dr.any(gradient != 0, axis=None) for gradient in gradients):
             warn(
-                f"{self._name}: gradients came to {self._parameters} a second time since the last update, and could "
-                "not go on to the variables that these were computed from, as Dr.Jit forgets a computation once "
-                "gradients have passed through it; assign the parameters and update before each view, or differentiate "
-                "one loss of all views, as loss_of_views computes it"
+                f"{self._name}: gradients reached {self._parameters} a second time since the last update, but not the "
+                "variables that these were computed from, as Dr.Jit forgets a computation after one backward pass; "
+                "assign and update the parameters before each view, or differentiate the sum of loss_of_views"
             )
 
     def _made(self) -> Any:

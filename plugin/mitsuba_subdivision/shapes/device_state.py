@@ -99,7 +99,7 @@ def traversed(
     variant: Variant,
     traverse: Callable[[Any], None],  # Bound method of an object, such as ``mesh.traverse``
 ) -> list[tuple[str, Any, Any]]:
-    """What an object of Mitsuba shows to `traverse`: name, value, and type of a value that is a member in C++.
+    """Parameters that a Mitsuba object exposes to `traverse`: name, value, and the type of C++ members.
 
     The functions ``get_property`` and ``set_property`` of the variant read and assign such values, while the object is
     alive.
@@ -112,7 +112,7 @@ def traversed(
 @cache
 def _collector(variant: Variant) -> type:
     class Collector(variant.TraversalCallback):
-        """Collects what it is shown."""
+        """Collects these parameters."""
 
         def __init__(self) -> None:
             super().__init__()
@@ -125,10 +125,10 @@ def _collector(variant: Variant) -> type:
 
 
 def require_values(
-    values: FloatBuffer,  # Of a parameter, flat
+    values: FloatBuffer,  # Flat values of a parameter
     count: int,
     size: int,  # Number of components of a value
-    kind: str,  # What a value is called in messages
+    kind: str,  # Noun for a value in messages
     *,
     are_new: bool = True,  # Whether they may be others than before
 ) -> None:

@@ -34,7 +34,7 @@ GRAZING = 1e-2
 SAME_PARAMETERS = 1e-3
 _NORMAL_DERIVATIVES = int(mi.RayFlags.dNSdUV) | int(mi.RayFlags.dNGdUV)
 _PARAMETERS = int(mi.RayFlags.UV) | int(mi.RayFlags.dPdUV) | _NORMAL_DERIVATIVES
-_KINDS = ("are on the ray", "are along the normal nearby", "are shaded where the triangle lies in the surface")
+_KINDS = ("are on the ray", "are along the normal", "are at the triangle's parameters")
 _FOLLOWS, _DETACHES = int(mi.RayFlags.FollowShape), int(mi.RayFlags.DetachShape)
 
 # Number of fixed-point iterations of `ExactShading.hit_by_texcoords`. Each removes most of the difference between
@@ -54,7 +54,7 @@ class ExactShading:
         self,
         variant: Variant,
         shape: mi.Mesh,  # Its current material is used at each hit; not kept alive
-        name: str,  # Of the cage, in messages
+        name: str,  # Name of the cage in messages
         kernel: SurfaceKernel,  # The surface in object space, relative to the centre of the placement
         channels: dict[str, ChannelKernel],  # See `channels_at_hits`
         placement: Placement,
@@ -62,7 +62,7 @@ class ExactShading:
     ) -> None:
         self._variant, self._name, self.kernel, self.channels = variant, name, kernel, channels
         self._shape: Callable[[], mi.Mesh | None] = weakref.ref(shape)
-        # Of normals, relative to those of the surface
+        # Sign of normals, relative to the surface's
         self._sign = -1.0 if shape.has_flipped_normals() else 1.0
         self._counts: IndexBuffer = dr.zeros(kernel.types.index, len(_KINDS))
         self._texcoords = channels.get(TEXCOORDS)

@@ -149,7 +149,7 @@ def read_parameters(props: mi.Properties) -> Parameters:
         if displacement is not None:
             raise ValueError(
                 f'parameters "displacement" and "{other}" contradict each other; expected only one of them, as other '
-                "forms than the stabilised one have no derivatives that are good enough"
+                "forms than the stabilised one have no accurate derivatives"
             )
         if shading == "exact":
             raise ValueError(

@@ -260,7 +260,7 @@ def make_subdivision(
             if self._device_state is not None and self._device_state.is_frozen:
                 raise RuntimeError(
                     f"{self._parameters.source}: a frozen function has read the triangles of this shape; choose others "
-                    "before it is called first, or load the scene anew"
+                    "before its first call, or load the scene again"
                 )
 
         def _require_control_points(self, *, are_new: bool) -> None:
@@ -383,7 +383,7 @@ def make_subdivision(
             """Raise RuntimeError: a merged mesh would not follow the control points."""
             raise RuntimeError(
                 f"{self._parameters.source}: merge: the shape's vertices follow its control points; expected meshes "
-                "without any, such as those of files that write_ply writes"
+                "without control points, such as files of write_ply"
             )
 
         def _require_at_vertices(self, method: str, quantity: str, exists: bool) -> None:

@@ -196,7 +196,7 @@ class AdaptiveGrid:
     side_counts: IndexArray  # (t, m) int32: segments on each side of each tile
     # (n,) int32: position of each sample on the line of its side, without that at which the side ends
     position: IndexArray
-    topology: Topology  # Of the elements. Samples on the same edges and vertices of it are one vertex.
+    topology: Topology  # Mesh of the elements. Samples on the same edge or vertex of it are one vertex.
     keeps_corner: NDArray[np.bool_]  # (t, m): as for `stitched`
 
     @classmethod

@@ -34,7 +34,7 @@ BESIDE_OUTLINE = np.radians(4)
 Measure = Literal["chord", "edge"]
 HeightsAt = Callable[[IntArray, FloatArray], FloatArray]
 
-# Least divisor. Not NumPy's finfo, of which NumPy before 2.3 warns where Dr.Jit computes without subnormals.
+# Least divisor. Not by NumPy's finfo, as NumPy before 2.3 warns where Dr.Jit computes without subnormals.
 TINY = sys.float_info.min
 # Excess over an integer that counts as rounding error and does not round a rate up.
 RATE_ROUNDING = 1e-9

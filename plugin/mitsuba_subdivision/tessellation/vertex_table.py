@@ -321,7 +321,7 @@ class Tessellation:
         ValueError
             If the format is unknown, or the package that writes it is missing.
         OSError
-            If the file cannot be written; an existing one is then left as it was.
+            If the file cannot be written; an existing one is then unchanged.
         """
         from ..files.formats import write_triangles
 
