@@ -3,10 +3,11 @@ from mitsuba_subdivision import LimitSurface
 from reference.exact_samples import SCHEMES, ExactSamples, samples_at
 
 # Both sides of the ordinary ones, even and odd; beyond, they differ in numbers only.
-VALENCES = (*range(3, 9), 20, 50)
+CASES = [(scheme, valence) for scheme in SCHEMES for valence in (*range(3, 9), 20)]
+CASES += [pytest.param((scheme, 50), marks=pytest.mark.long) for scheme in SCHEMES]
 
 
-@pytest.fixture(params=[(s, n) for s in SCHEMES for n in VALENCES], ids=lambda p: f"{p[0]}-{p[1]}")
+@pytest.fixture(params=CASES, ids=lambda case: f"{case[0]}-{case[1]}")
 def exact(request) -> ExactSamples:
     return samples_at(*request.param)
 

@@ -147,9 +147,9 @@ LASTING = 1, 0.3, (9.9, 9, 8.3, 7.6, 6.5, 5.2, 4.8, 3.7, 2.4, 1.7)
             for c, cage in enumerate(CAGES.values())
             for m, mode in enumerate(MODES)
         ),
-        *((*cage, mode, *LASTING) for cage in CAGES.values() for mode in MODES[:2]),
+        *((*cage, mode, *LASTING) for cage in CAGES.values() for mode in MODES[:1]),
     ],
-    ids=[*(f"{name}-{mode}" for name in CAGES for mode in MODES), *(f"{n}-lasting-{m}" for n in CAGES for m in "01")],
+    ids=[*(f"{name}-{mode}" for name in CAGES for mode in MODES), *(f"{name}-lasting" for name in CAGES)],
 )
 def test_reference_refinements_have_the_same_points_and_values(scheme, cage, mode, refinements, share, sharpness):
     rng, kind, method = mixed(scheme, cage, mode)

@@ -1,7 +1,7 @@
 import numpy as np
 from fuzz import topologies
 
-FEW = 60
+FEW = 40
 
 
 def test_random_surfaces_equal_the_surfaces_of_their_refined_cages():

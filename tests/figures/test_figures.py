@@ -25,7 +25,7 @@ from mitsuba_subdivision.figures import (
     peers,
     scenes,
 )
-from mitsuba_subdivision.figures.output import write_figure
+from mitsuba_subdivision.figures.output import rows_of, write_figure
 from mitsuba_subdivision.figures.staging import (
     around_vertices,
     frame,
@@ -84,6 +84,12 @@ def test_the_command_line_knows_every_figure_and_the_table_every_function_that_d
     pattern = re.compile(r"^def draw_(\w+)\(options: FigureOptions\)", re.MULTILINE)
     functions = {(path.stem, name) for path in paths for name in pattern.findall(path.read_text())}
     assert {(figure.module, name) for name, figure in FIGURES.items()} == functions
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+@pytest.mark.parametrize("width", [84, 178])
+def test_all_panels_have_a_place(tmp_path, width, count):
+    assert 0 <= np.prod(rows_of(FigureOptions(tmp_path, width=width), count)) - count < 2
 
 
 def test_figures_of_users_leave_a_checkout_as_it_is():

@@ -111,7 +111,10 @@ def test_nearest_points_of_a_flat_sheet_are_projections():
     np.testing.assert_allclose(nearest.n, [[0, 0, 1]] * 5, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", ["valence 3", "valence 50", "dart", "loop valence 3", "doo_sabin mixed torus"])
+HIGH = pytest.param("valence 50", marks=pytest.mark.long)
+
+
+@pytest.mark.parametrize("name", ["valence 3", HIGH, "dart", "loop valence 3", "doo_sabin mixed torus"])
 def test_points_above_places_at_and_next_to_extraordinary_ones(name, np_rng):
     surface = surface_named(name)
     deep = np.repeat([2.0**-8, 2.0**-40, 0], 2)[:, None]

@@ -363,7 +363,7 @@ def noisier(rng, factor, batches=4):
     ).stored()
 
 
-@pytest.mark.parametrize(("of_reference", "of_test"), [(0, 1), (0.2, 1), (1, 0.2), (1, 3)])
+@pytest.mark.parametrize(("of_reference", "of_test"), [(0, 1), (1, 0.2), (1, 3)])
 def test_each_image_has_its_own_noise(of_reference, of_test):
     """Of 100 seeds, one false alarm may be; of a reference without noise, too. A change of 2 % is seen by all."""
     rng = np.random.default_rng(7)

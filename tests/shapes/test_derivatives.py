@@ -52,16 +52,20 @@ EXACT = [
     *((scheme, (*PLACED, "cage_texcoords"), {}) for scheme in ("loop", "doo_sabin")),
     ("loop", (*PLACED, *VALUES, SCALE), HEIGHTS),
     ("doo_sabin", ("control_points", SCALE), HEIGHTS),
-    ("cube", (SCALE,), HEIGHTS),
-    ("cube", ("cage_weight",), HEIGHTS),
     ("cube", ("displacement.data",), {**HEIGHTS, "displacement": "bitmap"}),
 ]
+# Of what others have as well, alone.
+ALONE = [("cube", (name,), HEIGHTS) for name in (SCALE, "cage_weight")]
 
 
 @llvm
 @pytest.mark.parametrize(
     ("shading", "named", "by", "parameters"),
-    [*(("vertex", *case) for case in BOTH), *(pytest.param("exact", *case, marks=exact) for case in BOTH + EXACT)],
+    [
+        *(("vertex", *case) for case in BOTH),
+        *(pytest.param("exact", *case, marks=exact) for case in BOTH + EXACT),
+        *(pytest.param("exact", *case, marks=[exact, pytest.mark.long]) for case in ALONE),
+    ],
     indirect=["named"],
 )
 def test_derivatives_of_hits_are_differences(named, by, parameters, shading, np_rng):

@@ -377,7 +377,7 @@ def test_no_collection_comes_between_the_hits_of_a_kernel(monkeypatch):
         gc.disable()
         gc.collect()
         step()
-        kernels = [kernel for threshold in range(0, 400, 20) for kernel in step(threshold)]
+        kernels = [kernel for threshold in range(0, 400, 50) for kernel in step(threshold)]
         assert [kernel for kernel in kernels if not re.fullmatch("c*h*c*", kernel)] == []
         assert "hh" in "".join(kernels)
         assert "c" in "".join(kernels)

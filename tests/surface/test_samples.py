@@ -15,7 +15,7 @@ ROUNDED, NORMAL = 1e-13, 1e-10
 DERIVATIVE = 1e-12
 
 
-def locations(surface, rng, count=600):
+def locations(surface, rng, count=300):
     """All over the surface, near corners down to 1e-12 of an element and below, and at them."""
     element, uv, corner = random_locations(surface, rng, count)
     third = count // 3

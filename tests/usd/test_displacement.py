@@ -118,6 +118,7 @@ def test_ignored_displacements_warn(tmp_path, variant_scalar_rgb):  # noqa: ARG0
         assert message.endswith(expected)
 
 
+@pytest.mark.long
 def test_the_street_of_the_gallery_has_stones(variant_llvm_ad_rgb):  # noqa: ARG001
     """As high as its nodes say, 0.16 with some grain, at a rate that shows them."""
     street = msub.usd_scene(msub.example_file("cobbles.usda"), mi, size=(64, 36))["Scene_Street"]
