@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import drjit as dr
 
@@ -57,9 +58,7 @@ class Lines:
         return dr.select(self.hold, du, 0), dr.select(self.hold, dv, 0)
 
 
-# Not frozen: Dr.Jit assigns the fields of a loop's state.
-@dataclass(eq=False)
-class _Search:
+class _Search(NamedTuple):
     """State of the search for the hits of `line_hits`."""
 
     aim: Index
@@ -69,23 +68,25 @@ class _Search:
     # positive, or against it
     side: Float
     is_held: Mask  # Lanes that a border has stopped in the last round
+    # Location
+    half_edge: Index
+    u: Float
+    v: Float
     d: Vector3  # Direction of the line, or of the normal
-    location: Location
-    surface: PatchValues  # Without second derivatives
+    surface: tuple[Vector3, ...]  # `PatchValues.first_order`
 
 
-@dataclass(eq=False)
-class _Newton:
+class _Newton(NamedTuple):
     """State of the Newton steps of `piece_hits`."""
 
     steps_left: Index
-    d: Vector3  # Direction of the line, or of the normal
     # Sum of the steps
     u: Float
     v: Float
     length: Float  # Length of the last step
     is_along_surface: Mask  # Lanes whose last step was along the surface, towards another hit of the line
-    surface: PatchValues  # Before the last step, without second derivatives
+    d: Vector3  # Direction of the line, or of the normal
+    surface: tuple[Vector3, ...]  # `PatchValues.first_order` before the last step
 
 
 def line_hits(
@@ -109,15 +110,15 @@ def line_hits(
     """
     types = walk.types
 
-    def next_round(last: _Search) -> tuple[_Search]:
-        here, aim = last.location, last.aim
+    def next_round(last: _Search) -> _Search:
+        here, aim = Location(last.half_edge, last.u, last.v), last.aim
         row = walk.row(here.half_edge, active)
         piece = piece_at(here.half_edge, here.u, here.v, active, row)
         is_still, turns = last.is_held | (aim == MISSED), (aim == ON_NORMAL) & (last.rounds == 0)
         newton = piece_hits(
             types, piece, p, last.d, is_still=is_still, turns=turns, side=last.side, wanted_sign=wanted_sign
         )
-        surface, d = newton.surface, newton.d
+        surface, d = PatchValues(*newton.surface), newton.d
         offset = p - surface.value
         unclamped = Location(here.half_edge, here.u + newton.u, here.v + newton.v)
         is_finite = dr.isfinite(newton.u) & dr.isfinite(newton.v)
@@ -148,30 +149,16 @@ def line_hits(
         side = dr.select(newton.is_along_surface, last.side, dr.select(is_wrong_side, new_side, 0))
         # A point on the border that stops the search is not on its line.
         aim = dr.select(last.is_held & (aim == ON_LINE), types.index(ON_NORMAL), dr.select(fails, aim + 1, aim))
-        return (
-            _Search(
-                aim,
-                is_done,
-                dr.select(fails, 0, last.rounds + 1),
-                dr.select(fails, 0, side),
-                is_held,
-                d,
-                here.chosen(is_finite, target).chosen(fails, location),
-                PatchValues(*surface.first_order),
-            ),
-        )
+        reached = here.chosen(is_finite, target).chosen(fails, location)
+        rounds, side = (dr.select(fails, 0, value) for value in (last.rounds + 1, side))
+        return _Search(aim, is_done, rounds, side, is_held, reached.half_edge, reached.u, reached.v, d, newton.surface)
 
     no, zero = types.float(0) > 1, types.float(0)
-    start = _Search(types.index(ON_LINE), no, types.index(0), zero, no, d, location, _no_values(d))
-    (end,) = dr.while_loop(
-        (start,),
-        lambda state: active & ~state.is_done,
-        next_round,
-        mode="symbolic",
-        label="line_intersection",
-    )
-    from_first, corner = walk.from_first(end.location, active)
-    return from_first, end.aim, end.surface.seen_from_first(walk, corner)
+    given = location.half_edge, location.u, location.v
+    start = _Search(types.index(ON_LINE), no, types.index(0), zero, no, *given, d, (d * 0,) * 4)
+    end = _repeated(next_round, start, lambda state: active & ~state.is_done, "line_intersection")
+    from_first, corner = walk.from_first(Location(end.half_edge, end.u, end.v), active)
+    return from_first, end.aim, PatchValues(*end.surface).seen_from_first(walk, corner)
 
 
 def piece_hits(
@@ -188,7 +175,7 @@ def piece_hits(
 ) -> _Newton:
     """Intersect lines with the polynomial of a piece, continued beyond it, by Newton steps from its parameters."""
 
-    def next_step(last: _Newton) -> tuple[_Newton]:
+    def next_step(last: _Newton) -> _Newton:
         surface = piece.values(last.u, last.v)
         is_first = last.steps_left > steps
         d = dr.select(is_first & turns, surface.normal, last.d)
@@ -208,13 +195,32 @@ def piece_hits(
         # After a short step, only evaluate the surface there.
         is_short = (size * piece.magnification < STEP_TOLERANCE) & (last.steps_left > 1)
         left = dr.select(is_last | is_along_surface, 0, dr.select(is_short, 1, last.steps_left - 1))
-        return (_Newton(left, d, u, v, length, is_along_surface, PatchValues(*surface.first_order)),)
+        return _Newton(left, u, v, length, is_along_surface, d, surface.first_order)
 
     zero = types.float(0)
-    start = _Newton(types.index(steps + 1), type(d)(d), zero, zero, zero, zero > 1, _no_values(d))
-    (end,) = dr.while_loop((start,), lambda state: state.steps_left > 0, next_step, mode="symbolic", label="newton")
-    return end
+    start = _Newton(types.index(steps + 1), zero, zero, zero, zero > 1, d, (d * 0,) * 4)
+    return _repeated(next_step, start, lambda state: state.steps_left > 0, "newton")
 
 
-def _no_values(vector: Vector3) -> PatchValues:
-    return PatchValues(*(vector * 0 for _ in range(4)))
+def _repeated(step: Callable[[Any], Any], start: Any, is_active: Callable[[Any], Mask], label: str) -> Any:
+    """Repeat a step from a state while a condition holds: a loop over the numbers in the state.
+
+    Dr.Jit takes three times as long to find them in objects. The state ends with a vector, and a tuple of vectors.
+    """
+    make, vector, count = type(start), type(start.d), len(start) - 2
+
+    def numbers(state: Any) -> tuple:
+        return *state[:count], *state.d, *(number for each in state.surface for number in each)
+
+    def state(numbers: tuple) -> Any:
+        d, *surface = (vector(*numbers[i : i + 3]) for i in range(count, len(numbers), 3))
+        return make(*numbers[:count], d, surface)
+
+    end = dr.while_loop(
+        numbers(start),
+        lambda *values: is_active(state(values)),
+        lambda *values: numbers(step(state(values))),
+        mode="symbolic",
+        label=label,
+    )
+    return state(end)

@@ -88,14 +88,6 @@ class PatchValues:
             dv=self.dv + (uv * du + vv * dv),
         )
 
-    def at_values(self, known: PatchValues) -> PatchValues:
-        """Attach known values to the control points, with the gradients of this object."""
-        value, du, dv, normal = (
-            dr.replace_grad(dr.detach(getattr(known, name)), getattr(self, name))  # type: ignore[func-returns-value]  # The stub is wrong.
-            for name in ("value", "du", "dv", "normal")
-        )
-        return PatchValues(value, du, dv, normal, self.second)
-
     def seen_from_first(self, walk: ElementWalk, corner: Index) -> PatchValues:
         """Transform first derivatives from parameters seen from ``corner`` to those seen from the first corner."""
         a, b, c, d = turn_matrix(walk.domain, walk.types, corner)

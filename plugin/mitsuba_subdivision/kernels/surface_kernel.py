@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import drjit as dr
 import numpy as np
@@ -16,7 +16,7 @@ from ..patches.piece_table import PieceTable
 from .algebra import AffineMap, cross, over, unit
 from .array_types import ArrayTypes, Float, FloatBuffer, Index, Index4, Mask, Ray, Vector2, Vector3
 from .line_intersection import MISSED, ON_LINE, Lines, line_hits
-from .linear_maps import CoefficientMap, ControlValues
+from .linear_maps import CoefficientMap, ControlValues, attached
 from .locations import Location
 from .piece_kernel import PatchValues, Piece, PieceKernel, differences
 from .vertex_kernel import coordinates_expected
@@ -298,25 +298,80 @@ class SurfaceKernel:
             is_moving = dr.grad_enabled(coefficients, *variables)
             if constraint is not None and not (is_moving or dr.grad_enabled(*constraint.variables)):
                 constraint = None
-            slides = constraint is not None or dr.grad_enabled(location.u, location.v)
-            if known is not None and not (is_moving or slides or derivatives == 2):
-                return _points(location, known)
-            fixed = Location(location.half_edge, dr.detach(location.u), dr.detach(location.v))
-            piece = self._piece(coefficients, fixed.half_edge, fixed.u, fixed.v, active)
-            values = piece.values(derivatives=2 if slides else derivatives)
-            if known is not None and is_moving:
+            if known is None or derivatives == 2:
+                return self._traced(coefficients, location, active, derivatives, constraint)
+            points, lines = _points(location, known), cast("Lines | None", constraint)
+            if not (is_moving or lines):
+                return points
+            parts: Any
+            if self.displacement is None and dr.flag(dr.JitFlag.SymbolicScope):
+                parts = self._attached_later(points, type(coefficients)(coefficients), active, lines)
+            else:
                 # With the known primal values, Dr.Jit omits the evaluation from kernels that only need derivatives.
-                values = values.at_values(known)
-            if not slides:
-                return _points(location, values, derivatives)
-            step = (location.u, location.v) if constraint is None else constraint.step(values)
-            points = _sliding(piece, fixed, values, step, derivatives)
-            if isinstance(constraint, Lines) and piece.is_deep is not None:
-                # Derivatives of tangents are unbounded near extraordinary points, and would add noise.
-                dp_du = dr.select(piece.is_deep, values.du, points.dp_du)
-                dp_dv = dr.select(piece.is_deep, values.dv, points.dp_dv)
-                points = replace(points, dp_du=dp_du, dp_dv=dp_dv)
-            return points
+                traced: Any = _parts(self._traced(coefficients, location, active, 1, lines))
+                parts = dr.replace_grad(_parts(points), traced)  # type: ignore[func-returns-value]  # The stub is wrong.
+            *vectors, u, v = parts
+            return SurfacePoints(Location(location.half_edge, u, v), *vectors)
+
+    def _attached_later(
+        self, points: SurfacePoints, coefficients: FloatBuffer, active: Mask, lines: Lines | None
+    ) -> tuple[Vector3 | Float, ...]:
+        """Attach known hits to the coefficients and the lines, by code that is traced when derivatives are computed.
+
+        Dr.Jit traces a call for its values first, and again for derivatives.
+        """
+        ends = () if lines is None else lines.variables
+
+        def traced(coefficients: FloatBuffer, *ends: Vector3) -> tuple[Vector3 | Float, ...]:
+            constraint = None if lines is None else replace(lines, o=ends[0], d=ends[1])
+            return _parts(self._traced(coefficients, points.location, active, 1, constraint))
+
+        def propagated(mode: dr.ADMode, start: Any, changes: Any) -> None:
+            dr.accum_grad(start, changes)
+            dr.enqueue(mode, start)
+            dr.traverse(mode, dr.ADFlag.ClearNone)
+
+        def backward(*gradients: Vector3 | Float) -> tuple[Vector3 | Float, ...]:
+            with dr.resume_grad():
+                copies = _copies(ends)
+                # Sums go to the gradient of the coefficients themselves: a call cannot make arrays for them.
+                propagated(dr.ADMode.Backward, traced(coefficients, *copies), gradients)
+            return (0, *dr.grad(copies))
+
+        def forward(changes: tuple[Vector3 | Float, ...]) -> tuple[Vector3 | Float, ...]:
+            with dr.resume_grad():
+                copies = _copies((coefficients, *ends))
+                outputs = traced(*copies)
+                propagated(dr.ADMode.Forward, copies, (dr.grad(coefficients), *changes[1:]))
+            return dr.grad(outputs)
+
+        # Attached to all coefficients by the first one. With a literal index, Dr.Jit would copy it at once.
+        first = points.location.half_edge >> 31
+        argument = dr.gather(self.types.float, coefficients, first, active), *ends
+        return attached(_parts(points), argument, forward, backward)
+
+    def _traced(
+        self,
+        coefficients: FloatBuffer,
+        location: Location,
+        active: Mask,
+        derivatives: int,
+        constraint: Lines | NearestPoints | None,
+    ) -> SurfacePoints:
+        fixed = dr.detach(location)
+        piece = self._piece(coefficients, fixed.half_edge, fixed.u, fixed.v, active)
+        slides = constraint is not None or dr.grad_enabled(location.u, location.v)
+        values = piece.values(derivatives=2 if slides else derivatives)
+        if not slides:
+            return _points(location, values, derivatives)
+        step = (location.u, location.v) if constraint is None else constraint.step(values)
+        points = _sliding(piece, fixed, values, step, derivatives)
+        if isinstance(constraint, Lines) and piece.is_deep is not None:
+            # Derivatives of tangents are unbounded near extraordinary points, and would add noise.
+            dp_du = dr.select(piece.is_deep, values.du, points.dp_du)
+            dp_dv = dr.select(piece.is_deep, values.dv, points.dp_dv)
+            points = replace(points, dp_du=dp_du, dp_dv=dp_dv)
+        return points
 
     def _piece(
         self,
@@ -338,6 +393,17 @@ class SurfaceKernel:
         with dr.suspend_grad(), dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
             piece = partial(self._piece, dr.detach(self.coefficients))
             return line_hits(self.walk, piece, p, d, location, active, **limits)
+
+
+def _parts(points: SurfacePoints) -> tuple[Vector3 | Float, ...]:
+    return points.p, points.n, points.dp_du, points.dp_dv, points.location.u, points.location.v
+
+
+def _copies(arrays: tuple) -> tuple:
+    """Copies that are differentiated where the arrays are, without what these were computed from."""
+    copies = dr.detach(arrays)
+    dr.enable_grad([copy for copy, array in zip(copies, arrays, strict=True) if dr.grad_enabled(array)])
+    return copies
 
 
 def _points(location: Location, values: PatchValues, derivatives: int = 1) -> SurfacePoints:

@@ -114,6 +114,8 @@ class ExactShading:
     ) -> None:
         """Complete the surface interaction at a hit on a triangle, in place."""
         kernel, vector3 = self.kernel, self.kernel.types.vector3
+        # A copy, which may be kept: derivatives are traced later.
+        active = type(active)(active)
         b1, b2 = dr.detach(preliminary.prim_uv)
         if self._are_turned:
             b1, b2 = b2, b1
