@@ -18,7 +18,7 @@ from .textures import Textures
 
 GREY = [0.5, 0.5, 0.5]  # Default displayColor of USD's viewers
 _MOST_ETA = 1000.0  # Largest index of refraction; nearly all light is reflected
-_COSINES = np.sqrt((np.arange(64) + 0.5) / 64)  # Of angles of incidence of equal parts of uniform light
+_COSINES = np.sqrt((np.arange(64) + 0.5) / 64)  # Angles of incidence of equal parts of uniform light
 _MIRROR = 0.001  # Width of the narrowest lobe of `principled`, at the limit of float32; narrower lobes are mirrors
 _LEAST_ETA = 1.001  # With an index of 1, `principled` loses its metal
 # Inputs that Mitsuba's BSDFs need between 0 and 1; plain images and primvars are kept.
@@ -193,7 +193,7 @@ class _Surface:
         return _masked(self._coated(entry), self.number(self._inputs["opacity"]))
 
     def _coated(self, entry: SceneNode) -> SceneNode:
-        """A BSDF below the coat, which reflects as a dielectric at each angle and dims what lies below by its mean."""
+        """A BSDF below a coat, which reflects as a dielectric, and dims the base by its mean reflectance."""
         if self._is("coat", 0) or (eta := _index(self._reflectance("coat_ior"))) == 1:
             return entry
         mean = float(conductor_reflectance(eta, 0, _COSINES).mean())

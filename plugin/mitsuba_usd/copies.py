@@ -1,4 +1,4 @@
-"""Copies in place of many instances, for which JIT variants compile programs in the square of their number of time."""
+"""Copies in place of many instances, whose code takes JIT variants a time that is quadratic in their number."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Rates = Mapping[ShapeContents, IntArray]  # Needed segments on each edge, (n,) f
 
 
 def with_large_copies(contents: SceneContents) -> SceneContents:
-    """Contents where instances of large or displaced shapes are shapes of their own, if there are many instances."""
+    """Contents with separate shapes in place of many instances of large or displaced shapes."""
     if len(contents.instances) < LEAST_INSTANCES:
         return contents
     # Heights are in the space of each copy, and one mesh of all copies has one.
@@ -58,9 +58,9 @@ def with_large_copies(contents: SceneContents) -> SceneContents:
 def with_copies(
     contents: SceneContents, rates: Rates, shading: str, notes: StageWarnings, lowest: int = 1
 ) -> tuple[SceneContents, dict[ShapeContents, int]]:
-    """Contents where many copies of a shape are one shape for each rate that they need; and the rates of such shapes.
+    """Contents with one shape for many copies that need the same rate, and the rates of such shapes.
 
-    If all would take more than `MOST_BYTES`, the highest rate is lowered down to the lowest; or else instances stay.
+    If they need more than `MOST_BYTES`, rates are lowered down to the lowest; if that does not suffice, instances stay.
     """
     is_displaced = any(shape.is_displaced for group in contents.groups for shape in group)
     are_many = len(contents.instances) >= LEAST_INSTANCES and not is_displaced

@@ -24,7 +24,7 @@ from .stage_warnings import StageWarnings
 from .textures import Textures, samples_elsewhere
 
 TEXELS_PER_PIXEL = 2.0  # Texels for each pixel: filters see details of half a pixel, and glass magnifies
-# Quantiles of edges, a few of which may have collapsed in the texture, and of texels; and most edges that are measured.
+# Quantile of edges, as a few may have collapsed in the texture; quantile of texels; most edges that are measured.
 _MOST_EDGES, _MOST_TEXELS, _MOST_SAMPLES = 0.95, 0.99, 20_000
 # Outlines of sensors and the distances of their near planes; see `outline_for`.
 Views = Sequence[tuple[SceneNode, float]]
@@ -91,7 +91,7 @@ def segments_of(
 
 
 def texels_for_pictures(contents: SceneContents, sensors: Sequence[SceneNode]) -> dict[str, float]:
-    """Most pixels along the sides of each image file, or of its tiles, that pictures by sensors show.
+    """Largest useful number of pixels along the sides of each image file, or of its tiles, for pictures by sensors.
 
     Files of unknown detail are missing, or infinite.
     """
@@ -154,7 +154,7 @@ def _pixels(texture: SceneNode) -> NDArray:
 
 
 def rate_of_heights(cage: CageContents, texture: SceneNode, error: float) -> int:
-    """Segments on each edge whose chords are within an error of most heights of a bitmap of one channel."""
+    """Segments on each edge that follow most heights of a one-channel bitmap within an error."""
     heights = _pixels(texture)
     length = 1  # In texels, powers of two
     while 4 * length <= min(heights.shape):
@@ -175,7 +175,7 @@ def with_own_parameters(
     textures: Textures,
     notes: StageWarnings,
 ) -> dict[ShapeContents, dict[str, Any]]:
-    """Parameters of limit surfaces with the displacements of their materials, at rates that show them, or own rates."""
+    """Parameters of limit surfaces with displacements, at rates that show them, or with rates that the stage states."""
     shapes = [shape for shape in contents.all_shapes if shape.is_displaced and "displacement" not in parameters]
     placements = contents.placements if shapes else {}
     corners = sum(len(shape.cage.face_vertices) for shape in shapes)

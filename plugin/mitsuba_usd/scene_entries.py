@@ -40,7 +40,7 @@ from .sensors import RESERVED
 from .stage_warnings import StageWarnings
 from .textures import Textures
 
-# Faces of cages whose control points stand for the surface: a sphere with 64 around is smaller by a six-hundredth.
+# Least faces of cages that are framed by their control points: a sphere with 64 around is smaller by 1/600.
 DENSE = 2_000
 _NO_POINTS: NDArray[np.float64] = np.zeros((0, 3))
 _MOVABLE = frozenset({"cage", "to_world"})  # Fields of a shape that may differ between frames that share an object
@@ -295,7 +295,7 @@ class LoadedShapes:
     def object_of(
         self, shape: ShapeContents, entry: Callable[[SceneNode], SceneNode], bsdf: Callable[[], SceneNode]
     ) -> mi.Object:
-        """The object of a shape, from functions that return its entry with a BSDF, and the entry of the BSDF.
+        """The object of a shape; ``entry`` makes its scene entry with a BSDF, and ``bsdf`` the entry of the BSDF.
 
         Raises CageError, SchemeError as `subdivision` does.
         """

@@ -33,7 +33,7 @@ def sensor(
 
 
 def _accepted(stated: SceneNode, own: SceneNode, what: str, prim: str, notes: StageWarnings) -> SceneNode:
-    """The stated entry, or the own one, with a warning, if Mitsuba cannot load it."""
+    """The authored entry, or else the default, with a warning, if Mitsuba cannot load it."""
     try:
         return stated if stated is own or mi.load_dict(stated) else own
     except RuntimeError as error:

@@ -144,7 +144,7 @@ def read_curves(
     for primvar in filter(UsdGeom.Primvar.HasValue, map(primvars.GetPrimvar, names)):
         values, given = _flattened(primvar, time), str(primvar.GetInterpolation())
         if not topology.has(len(values), given):
-            notes.add("primvars of curves that have another number of values are ignored", primvar.GetAttr().GetPath())
+            notes.add("primvars of curves with another number of values are ignored", primvar.GetAttr().GetPath())
         elif given != "constant":
             powers = topology.powers(values, given)
             samples = (_PLACES[: 1 if given == "uniform" else None] ** np.arange(powers.shape[1])) @ powers

@@ -23,7 +23,7 @@ _KINDS: dict[str, tuple[str, ...]] = {
     "DomeLight": ("dome",),
     "DomeLight_1": ("dome",),
 }
-# Largest angle in degrees, of the Sun and some more, of a distant light that becomes a point without a warning.
+# Largest angle in degrees of distant lights without a warning: twice the Sun's.
 _POINTLIKE = 1.0
 _CONE = "inputs:shaping:cone:angle"
 # Ignored attributes of lights, their values without effect, and the reason.
@@ -150,7 +150,7 @@ def read_camera(
     shutter = [number("shutter:open"), number("shutter:close")]
     near, far = value_at(camera.GetClippingRangeAttr(), time)
     if not near <= far:
-        notes.add("a clippingRange of cameras that is not from a number to a larger one is ignored", path)
+        notes.add("clippingRange of cameras is ignored; expected a number and a larger one", path)
         near, far = 1.0, 1e6  # Defaults of the schema
     focal_length, f_stop, focus = number("focalLength"), number("fStop"), number("focusDistance")
     has_lens = is_perspective and f_stop > 0 and focus > 0

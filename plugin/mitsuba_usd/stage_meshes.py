@@ -1,4 +1,4 @@
-"""Meshes of a stage as plain data, one shape for each of their materials; and shapes that are no meshes in USD."""
+"""Meshes, curves and solids of a stage as plain data, one shape for each material."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ class ShapeReader:
         return replace(cage, attributes={**cage.attributes, **colors}) if wide else cage
 
     def _completed(self, prim: Usd.Prim, shape: ShapeContents, whole: CageContents | None = None) -> ShapeContents:
-        """A shape with its texture coordinates, constant primvars and emission, that of a part of a whole cage."""
+        """A shape, or a part of a whole cage, with its texture coordinates, constant primvars and emission."""
         cage, material = shape.cage, shape.material
         for name, fallback in [] if material is None else [*material.texcoords().items()][:1]:
             cage = self._with_texcoords(prim, cage, name, fallback)

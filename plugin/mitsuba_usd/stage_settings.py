@@ -38,7 +38,7 @@ def read_settings(
     if not settings:
         others = [str(prim.GetPath()) for prim in stage.Traverse() if prim.IsA(UsdRender.Settings)]
         if others or stage.HasAuthoredMetadata("renderSettingsPrimPath"):
-            what = "only the render settings of renderSettingsPrimPath are used; all others are ignored"
+            what = "render settings are ignored unless renderSettingsPrimPath of the stage names them"
             notes.add(what, ", ".join(others) or str(stage.GetMetadata("renderSettingsPrimPath")))
         return PictureContents(), None, {}
     prim, path, targets = settings.GetPrim(), settings.GetPath(), settings.GetProductsRel().GetForwardedTargets()

@@ -142,8 +142,8 @@ def open_pbr_surface(i: Given) -> dict[str, Input]:
 def preview_surface(i: Given) -> dict[str, Input]:
     """UsdPreviewSurface.
 
-    By its specification and MaterialX's graph, opacity below 1 is clear glass if ``opacityMode`` is transparent, its
-    default, also below rough reflections. Images of opacity are presence, as for leaves, unless the mode is authored.
+    By its specification and MaterialX's graph, opacity below 1 is clear glass for the default ``opacityMode``,
+    transparent; roughness applies to reflections. Images of opacity are presence, unless the mode is authored.
     """
     is_specular = i("useSpecularWorkflow") == 1
     opacity, threshold, mode = i("opacity"), i("opacityThreshold"), i("opacityMode")

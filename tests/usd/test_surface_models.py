@@ -283,10 +283,9 @@ def test_coats_dim_the_base():
     reflected, _ = both("standard_surface", 0, base_color=COLOR, specular=0.0, coat=0.5, coat_IOR=1.6)
     np.testing.assert_allclose(reflected, (1 - 0.5 * mean) * np.array(COLOR) + 0.5 * (0.6 / 2.6) ** 2, rtol=SAMPLED)
     bumps = TextureContents("bumps.png", "rgb", "raw")
-    normals = {"standard_surface": {"normal"}, "UsdPreviewSurface": {"normal", "coat_normal"}}
-    for model, expected in normals.items():
-        given = {"normal": bumps, "opacityMode": ""}
-        assert {k for k, v in surface_models.material("/paint", model, given).inputs.items() if v is bumps} == expected
+    for model, expected in (("standard_surface", {"normal"}), ("UsdPreviewSurface", {"normal", "coat_normal"})):
+        inputs = surface_models.material("/paint", model, {"normal": bumps, "opacityMode": ""}).inputs
+        assert {name for name, value in inputs.items() if value is bumps} == expected
 
 
 @pytest.mark.parametrize("degrees", [0, 45, 60, 80])
