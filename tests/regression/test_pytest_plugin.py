@@ -241,10 +241,14 @@ def test_the_pictures_of_a_failed_run_are_accepted_by_one_command(with_reference
     failing(with_reference)
     assert main(command) == 0
     with_reference.runpytest("-W", "error").assert_outcomes(passed=1)
+    # A test that passes takes its report away.
+    assert not [path for path in (with_reference.path / "failures").rglob("*") if path.is_file()]
     samples = load_image(reference(with_reference)).metadata["sampling"]
     assert (samples["batches"], samples["batch"]) == ([[0, 32]], 16)
     accepted = reference(with_reference).read_bytes()
     with_reference.makefile(".xml", ball=SCENE)
+    failing(with_reference)
+    make_brighter(with_reference)
     assert main(command) == 3
     assert "has changed since the report" in capsys.readouterr().err
     assert reference(with_reference).read_bytes() == accepted

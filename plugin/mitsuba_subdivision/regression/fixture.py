@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shlex
+import shutil
 import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -23,7 +24,7 @@ from ..whole_file import require_writable
 from . import ContentElsewhere, RegressionError, renders
 from .compare import Comparison
 from .image import Image, load_image, save_image
-from .report import write_report
+from .report import NUMBERS, write_report
 from .scene import BOX, SceneSource, load_scene
 from .tiers import Status, Tolerances
 
@@ -194,10 +195,13 @@ class RenderRegression:
             warnings.warn(RenderWarning(f"{name}: {line}"), stacklevel=3)
 
     def _report(self, comparison: Comparison, name: str, scene: SceneSource, path: Path) -> str:
-        """Write a report if the settings request one; returns a line with its path."""
+        """Write a report if the settings request one, in place of an earlier one; returns a line with its path."""
+        folder = self.results / re.sub(r"[^\w.-]+", "-", f"{self.node.nodeid}-{name}").strip("-")
+        if (folder / NUMBERS).is_file():
+            shutil.rmtree(folder)
+            self.reported = True
         if self.reports == "none" or (self.reports == "failures" and comparison.status is not Status.FAIL):
             return ""
-        folder = self.results / re.sub(r"[^\w.-]+", "-", f"{self.node.nodeid}-{name}").strip("-")
         try:
             page = write_report(folder, comparison, f"{name}: {self.node.nodeid}")
             files = {"reference": path, **({"scene": scene} if isinstance(scene, Path) else {})}

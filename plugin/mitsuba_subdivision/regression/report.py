@@ -57,7 +57,7 @@ def write_report(folder: str | Path, comparison: Comparison, title: str | None =
 
 
 def write_index(folder: str | Path) -> Path | None:
-    """Write a page that links to the reports in a folder, the failed ones first; None if there are none."""
+    """Write a page that links to the reports in a folder, the failed ones first; none if there are no reports."""
     folder = Path(folder)
     rows = []
     for path in sorted(folder.glob(f"*/{NUMBERS}")):
@@ -66,6 +66,7 @@ def write_index(folder: str | Path) -> Path | None:
         link = f'<a href="{html.escape(path.parent.name)}/{PAGE}">{html.escape(report["title"])}</a>'
         rows.append((report["status"], f"<tr><td>{_badge(report['status'])}<td>{link}<td>{html.escape(tiers)}"))
     if not rows:
+        (folder / PAGE).unlink(missing_ok=True)
         return None
     rows.sort(key=lambda row: ["fail", "warn", "pass"].index(row[0]))
     lines = "".join(line for _, line in rows)
