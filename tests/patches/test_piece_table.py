@@ -47,19 +47,19 @@ def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkey
     refine_first(monkeypatch)
     cage = tagged(mixed_torus(), creases=[(0, 8, INFINITE), (8, 16, INFINITE)])
     surface = LimitSurface(bumpy(cage))
-    table, refined = surface.pieces(), surface.patches.refined
+    table, (refined, matrix) = surface.pieces(), surface.patches.refined
     assert surface.patches.topology.vertex_count > cage.vertex_count
-    assert table.refinement.shape == (refined.table.topology.vertex_count, cage.vertex_count)
+    assert table.refinement.shape == (refined.topology.vertex_count, cage.vertex_count)
     np.testing.assert_allclose(table.refinement.sum(axis=1), 1, rtol=0, atol=ROUNDING)
     positions = surface.cage.positions
-    expected = refined.matrix @ positions[surface.cage.cut_mesh.vertex]
+    expected = matrix @ positions[surface.cage.cut_mesh.vertex]
     np.testing.assert_allclose(table.refinement @ positions, expected, rtol=0, atol=ROUNDING)
-    np.testing.assert_array_equal(table.controls, refined.table.controls)
+    np.testing.assert_array_equal(table.controls, refined.controls)
     assert surface.sampling(1).refinement is table.refinement
     # The patch at a half-edge is the refined face there.
-    corners = np.concatenate([group.corners for group in refined.table.classes])
+    corners = np.concatenate([group.corners for group in refined.classes])
     for half_edge, code in enumerate(table.half_edges[:, layout.CODE]):
-        assert corners[code // layout.PATCH] == refined.table.topology.face_offsets[half_edge]
+        assert corners[code // layout.PATCH] == refined.topology.face_offsets[half_edge]
 
 
 def test_parts_of_equal_division_share_pieces():

@@ -35,7 +35,7 @@ def tiles_of(surface, scheme, side=None):
     """Tiles of irregular classes: kinds, control points, and samples ``(s, t, 3)`` of them, or of their sides."""
     patches, points = surface.patches, surface.cage.positions[surface.cage.cut_mesh.vertex]
     if patches.refined is not None:
-        patches, points = patches.refined.table, patches.refined.matrix @ points
+        patches, points = patches.evaluated, patches.evaluated_points(points)
     u, v = (index.ravel() / SAMPLES for index in np.indices((SAMPLES + 1,) * 2))
     uv = np.stack([u, v], axis=1)[scheme.domain.inside(np.stack([u, v], axis=1)) >= 0]
     if side is not None:

@@ -33,8 +33,8 @@ from ..patches.piece_table import (
     REST,
     TERM,
     TURN,
+    UNEVEN,
     WHOLE,
-    FrameKind,
     PieceTable,
     piece_packets,
 )
@@ -50,7 +50,6 @@ LEAST_EXTENT = 2.0**-64
 DIFFERENCE = 2.0**-10
 # Dr.Jit only accepts plain integers, not enumerations.
 _ONLY_CHILD, _REGULAR, _TIP = map(int, (PartKind.ONLY_CHILD, PartKind.REGULAR, PartKind.TIP))
-_UNEVEN = int(FrameKind.UNEVEN)
 
 
 # Not frozen, as `Location` is not.
@@ -302,7 +301,7 @@ class PieceKernel:
             frames: tuple = ()
             if self._has_frames and size == 3:
                 frame = tip_code & FRAMES
-                is_uneven = is_deep & (frame == _UNEVEN) & (level >= PIECE_LEVELS) & ~is_rest
+                is_uneven = is_deep & (frame == UNEVEN) & (level >= PIECE_LEVELS) & ~is_rest
                 needs_frame = is_uneven | (is_deep & is_rest & (frame != 0))
                 frame_row = dr.select(is_uneven, row, dr.fma(term_count, FRAME, block_row))
                 frame_factor = factor + dr.select(is_uneven, (level_count + 1) * term_count, 0)

@@ -8,7 +8,7 @@ cage may have millions of elements, but has few classes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,7 +18,7 @@ from ..evaluation.patch_tree import PatchTree, patch_trees
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.one_ring import RingTable, one_rings
-from ..mesh.shared import Content, shared
+from ..mesh.shared import Content, shared_by_key
 from ..mesh.signature import Signature, fan_codes, row_codes, signatures_at
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
@@ -123,7 +123,7 @@ class PatchTable:
     def forget(self) -> None:
         """Drop data that are computed again on demand, for a mesh that only its kernels evaluate."""
         refined = vars(self).get("refined")
-        for part in (self, self.topology, *([] if refined is None else [refined.table, refined.table.topology])):
+        for part in (self, self.topology, *([] if refined is None else [refined[0], refined[0].topology])):
             for name in [name for name, value in vars(type(part)).items() if isinstance(value, cached_property)]:
                 if name != "refined":
                     vars(part).pop(name, None)
@@ -157,8 +157,13 @@ class PatchTable:
         return order, np.flatnonzero(sorted_codes[1:] != sorted_codes[:-1]) + 1
 
     @cached_property
-    def refined(self) -> RefinedPatches | None:
-        """Patches of the cage refined once, if that leaves far fewer classes, see `RefinedPatches`; else None."""
+    def refined(self) -> tuple[PatchTable, sparse.csr_array] | None:
+        """Patches of the cage refined once, and ``(n, n_v)`` weights of its vertices, if that leaves far fewer classes.
+
+        As where polygons of many sizes meet vertices of many valences, and nearly every patch is a class: after a
+        refinement, an old vertex has only new neighbours, which are of few kinds. All faces of the refined cage are
+        elements, and whole. Normals in float32 are 2 to 5 times less exact, as its vertices are rounded.
+        """
         if self.class_count <= max(MANY_CLASSES, self.patch_count // FEW_PATCHES):
             return None
         if self.elements is not self.topology or not self.scheme.splits_corners:
@@ -167,12 +172,12 @@ class PatchTable:
         table = PatchTable(refinement.topology, self.scheme, may_turn=False)
         if FEWER * table.class_count > self.class_count:
             return None
-        return RefinedPatches(table, refinement.stencils.matrix)
+        return table, refinement.stencils.matrix
 
     @property
     def evaluated(self) -> PatchTable:
         """The table whose patches are evaluated: that of the cage refined once, or this one."""
-        return self if self.refined is None else self.refined.table
+        return self if self.refined is None else self.refined[0]
 
     def places(self, patch_class: PatchClass) -> IndexArray:
         """``(p,)`` the corner of the element that each patch of `evaluated` covers, a half-edge of `elements`."""
@@ -187,7 +192,7 @@ class PatchTable:
 
     def evaluated_points(self, points: FloatArray) -> FloatArray:
         """``(n, k)`` values at the vertices of the mesh of `evaluated`, from those at this table's mesh vertices."""
-        return points if self.refined is None else self.refined.matrix @ points
+        return points if self.refined is None else self.refined[1] @ points
 
     def control_rows(
         self,
@@ -198,10 +203,10 @@ class PatchTable:
         """`controls` as rows of control values; for refined patches, also the matrix that refines the cage's values."""
         if control_of_vertex is None:
             control_of_vertex, control_count = self.control_of_vertex, self.control_count
-        refined = self.refined
-        if refined is not None:
-            matrix = shared(_over_control_values, refined, Content(control_of_vertex), control_count)
-            return refined.table.controls.view(np.uint32), matrix
+        if self.refined is not None:
+            key = _over_control_values, self, Content(control_of_vertex), control_count
+            over_values = partial(_over_control_values, self.refined[1], control_of_vertex, control_count)
+            return self.evaluated.controls.view(np.uint32), shared_by_key(key, over_values)
         controls = self.controls
         if not np.array_equal(control_of_vertex, np.arange(len(control_of_vertex))):
             controls = control_of_vertex.astype(np.int32)[controls]
@@ -274,25 +279,13 @@ class PatchTable:
         return corners + turns, least
 
 
-def _over_control_values(refined: RefinedPatches, control_of_vertex: Content, control_count: int) -> sparse.csr_array:
+def _over_control_values(
+    weights: sparse.csr_array, control_of_vertex: IntArray, control_count: int
+) -> sparse.csr_array:
     from scipy import sparse
 
     # Mesh vertices with the same control value share a column, where their weights add up, in place.
-    weights, shape = refined.matrix, (refined.matrix.shape[0], control_count)
-    columns = control_of_vertex.array.astype(weights.indices.dtype)[weights.indices]
+    columns, shape = control_of_vertex.astype(weights.indices.dtype)[weights.indices], (weights.shape[0], control_count)
     matrix = sparse.csr_array((weights.data, columns, weights.indptr), shape=shape, copy=True)
     matrix.sum_duplicates()
     return matrix
-
-
-@dataclass(frozen=True, eq=False)
-class RefinedPatches:
-    """Patches of a cage refined once, under a scheme that makes a quadrilateral of every face corner.
-
-    They serve cages where polygons of many sizes meet vertices of many valences, so that nearly every patch is a class.
-    In the refined cage, an old vertex has only new neighbours, which are of few kinds. Normals in float32 are 2 to 5
-    times less exact, as the refined cage's vertices are rounded.
-    """
-
-    table: PatchTable  # Of the refined cage, whose faces are all elements, and whole
-    matrix: sparse.csr_array  # (n, n_v) weights of the mesh's vertices at the refined cage's vertices

@@ -11,7 +11,6 @@ computed once for the control points, and suffice for nearly all samples. Deeper
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
 from functools import lru_cache
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -45,6 +44,9 @@ CORNERS, PATCH_CORNER, WHOLE, PATCH = 3, 4, 16, 32
 # the frame, unit and mask of the number of levels, unit of the number of terms.
 KINDS, TURN = 3, 4
 FRAMES, LEVEL, LEVELS, TERM = 3, 4, 1023, 4096
+# Where the normals of a tip need a frame in place of the derivatives: nowhere, at the extraordinary point, or at all
+# deeper levels (`uneven_frame`).
+NO_FRAME, AT_POINT, UNEVEN = range(3)
 # Blocks of `Tip.rows` after those of the regular children of a level: the rest, and the frame at the point; then come
 # the factors.
 REST, FRAME, FACTORS = LEVEL_PIECES, LEVEL_PIECES + 1, LEVEL_PIECES + 2
@@ -53,19 +55,9 @@ COEFFICIENT_BYTES = 1 << 26
 # Maximum number of pieces of a part whose coefficients are stored as a whole. Larger elements are split into parts:
 # along semi-sharp creases there are thousands of parts of few kinds, which share coefficients.
 SHARED_PIECES = 64
-
-
 # Rows of `PieceTable.classes`: index of the first entry in `controls`; numbers of patches and of controls per patch;
 # first piece, and number of pieces per patch.
 CLASS = np.dtype([(name, np.int64) for name in ("first_control", "patches", "controls", "first_piece", "pieces")])
-
-
-class FrameKind(IntEnum):
-    """Where the normals of a tip need a frame in place of the derivatives."""
-
-    DERIVATIVES = 0  # Nowhere
-    AT_POINT = 1  # At the extraordinary point
-    UNEVEN = 2  # At all deeper levels: `uneven_frame`
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +71,7 @@ class Tip:
     # third eigenvalue, follow.
     rows: FloatArray
     coordinates: FloatArray  # (t, K) float64: coordinates of the terms over the eigen-coordinates
-    frame: FrameKind
+    frame: int  # `NO_FRAME`, `AT_POINT` or `UNEVEN`
     level_count: int
 
 
@@ -87,7 +79,7 @@ class TreeArrays(NamedTuple):
     """Nodes, pieces and tips of a patch tree, with indices that begin at 0."""
 
     # (n, 4) int64; the first node is the element. `PartKind` plus `TURN` times `PatchTree.turn`; index of the first of
-    # consecutive children, or for a leaf of its first piece; index of a tip in `tips`; `FrameKind` of a tip plus
+    # consecutive children, or for a leaf of its first piece; index of a tip in `tips`; `Tip.frame` plus
     # `LEVEL` times the number of its levels, after which its rest begins, plus `TERM` times the number of its terms.
     # Pieces of a tip are consecutive, level by level; the coordinates of its terms are stored after them as pieces,
     # each of which begins with the first coordinate, the extraordinary point.
@@ -275,9 +267,9 @@ def _tip(patch: IrregularPatch, piece_levels: int) -> tuple[Tip, FloatArray]:
     size = -(-len(polynomials.powers) // PACKET) * PACKET
     rows = np.pad(blocks.reshape(-1, blocks.shape[2]), ((0, 0), (0, size - blocks.shape[2])))
     rows = np.concatenate([rows, np.pad(values, (0, -len(values) % size)).reshape(-1, size)])
-    kind = FrameKind.AT_POINT if patch.has_own_frame else FrameKind.DERIVATIVES
+    frame_kind = UNEVEN if patch.contracts_unevenly else AT_POINT if patch.has_own_frame else NO_FRAME
     pieces = level_polynomials(patch, polynomials.matrix, np.arange(piece_levels))
-    tip = Tip(rows, coordinates, FrameKind.UNEVEN if patch.contracts_unevenly else kind, level_count)
+    tip = Tip(rows, coordinates, frame_kind, level_count)
     return tip, pieces.reshape(LEVEL_PIECES * piece_levels, *pieces.shape[2:])
 
 
