@@ -1,4 +1,4 @@
-"""Which LLVM library Dr.Jit gets. Choices that Dr.Jit makes once per process are tested in processes of their own."""
+"""The choice of Dr.Jit's LLVM library. Choices that Dr.Jit makes once per process are tested in separate processes."""
 
 import os
 import secrets

@@ -1,4 +1,4 @@
-"""Every notebook of the guide runs, and what is stored in it is what its code says today."""
+"""Every notebook of the guide runs, with its stored outputs."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Where surfaces are folded or collapse to curves and points: normals are unit, or exactly zero, on every path."""
+"""Normals of surfaces that are folded or collapse to curves and points are unit or exactly zero, by every method."""
 
 import drjit as dr
 import numpy as np

@@ -1,4 +1,4 @@
-"""Cages that are no oriented manifold. That their surfaces are OpenSubdiv's is tested beside OpenSubdiv, in peers."""
+"""Cages that are no oriented manifolds. `tests/peers` compares their surfaces with OpenSubdiv's."""
 
 import re
 import warnings

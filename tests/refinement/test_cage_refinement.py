@@ -1,4 +1,4 @@
-"""A cage refined once has the same surface, and its points are those that the rules make, vertex by vertex."""
+"""A cage refined once has the same surface, and its points follow the rules, vertex by vertex."""
 
 import re
 import warnings

@@ -1,4 +1,4 @@
-"""The tiers on images made of numbers, where the truth is known."""
+"""The tiers on synthetic images, whose truth is known."""
 
 import math
 import re

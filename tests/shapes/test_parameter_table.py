@@ -1,4 +1,4 @@
-"""The parameter table says what the shape takes and what `traverse` shows; the plugin's page has all of it."""
+"""The parameter table lists the parameters of the shape and of `traverse`, and the plugin's page all of both."""
 
 import re
 

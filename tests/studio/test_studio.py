@@ -1,4 +1,4 @@
-"""The studio: what the camera frames, scenes of models, and scenes as XML."""
+"""The studio: framing by the camera, scenes of models, and scenes as XML."""
 
 import re
 import xml.etree.ElementTree as ElementTree

@@ -1,4 +1,4 @@
-"""What a picture needs: segments, points that a camera frames, copies as one shape, and images, loaded smaller."""
+"""Detail of pictures: segments, points that a camera frames, copies as one shape, and smaller images."""
 
 import struct
 import warnings

@@ -1,4 +1,4 @@
-"""Whole USD files in frames, saved as scenes, and with what they have by default."""
+"""Whole USD files in frames, saved as scenes, and with defaults."""
 
 import os
 from collections import Counter
