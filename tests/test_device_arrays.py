@@ -54,7 +54,7 @@ def address(array):
     return array.numpy().ctypes.data
 
 
-def test_memory_is_not_that_of_numpy(variant_llvm_ad_rgb):  # noqa: ARG001
+def test_uploads_do_not_use_numpys_memory(variant_llvm_ad_rgb):  # noqa: ARG001
     values = np.arange(20, dtype=np.float32)
     array = upload(mi.Float, values)
     assert address(array) != values.ctypes.data
@@ -82,7 +82,7 @@ def test_uploads_are_complete_for_other_threads(variant_llvm_ad_rgb):  # noqa: A
             assert np.array_equal(pool.submit(array.numpy).result(), values)
 
 
-def test_a_user_s_array_is_taken_over_in_place_unless_it_has_derivatives(variant_llvm_ad_rgb):  # noqa: ARG001
+def test_arrays_of_users_are_copied_in_place_unless_they_have_derivatives(variant_llvm_ad_rgb):  # noqa: ARG001
     values = np.arange(20, dtype=np.float32)
     mapped = mi.Float(values)
     assert address(mapped) == values.ctypes.data

@@ -59,7 +59,7 @@ CRASHES = pytest.mark.skipif(not hasattr(os, "kill"), reason="processes have no 
         ("import time; time.sleep(60)", "did not end within 0.2 s"),
     ],
 )
-def test_the_report_says_how_a_process_ended(monkeypatch, child, problem):
+def test_the_report_states_how_a_process_ended(monkeypatch, child, problem):
     monkeypatch.setattr(doctor, "_CHILD", child)
     report = try_variant("scalar_rgb", seconds=0.2 if "sleep" in child else 60)
     assert (report["works"], report["problem"]) == (False, problem)

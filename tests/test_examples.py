@@ -4,7 +4,7 @@ import pytest
 from mitsuba_subdivision import example_file
 
 
-def test_examples_are_found_from_any_folder_and_missing_ones_are_errors_that_name_the_folders(tmp_path, monkeypatch):
+def test_examples_are_found_from_any_folder_or_errors_name_the_folders(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("cages/rook.obj", "rook.xml", "export_cage.py"):
         assert Path(example_file(name)).is_absolute()

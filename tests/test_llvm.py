@@ -1,4 +1,4 @@
-"""Which LLVM library Dr.Jit gets. Choices that Dr.Jit makes once per process are tested in processes of their own."""
+"""The choice of Dr.Jit's LLVM library. Choices that Dr.Jit makes once per process are tested in separate processes."""
 
 import os
 import secrets
@@ -111,9 +111,7 @@ def test_a_folder_with_a_star_matches_names_by_their_beginning(tmp_path):
         (["libLLVM.so.19.1"], [], "x86_64", llvm.NO_USABLE_LLVM, 19),
     ],
 )
-def test_libraries_of_python_come_before_those_of_the_system(
-    fresh, monkeypatch, python, system, machine, setting, version
-):
+def test_libraries_of_python_precede_the_systems(fresh, monkeypatch, python, system, machine, setting, version):
     for folder, names in zip(fresh, (python, system), strict=True):
         for name in names:
             (folder / name).touch()

@@ -1,4 +1,4 @@
-"""What the command line tells: of wrong input one line, without tracebacks; and of long work how far it is."""
+"""Messages of the command line: one line about wrong input, without tracebacks, and progress of long work."""
 
 import dataclasses
 import errno

@@ -1,4 +1,4 @@
-"""Files appear whole or not at all, whatever happens to the process that writes them or to its disk."""
+"""Files are complete or absent after any failure of their process or the disk."""
 
 import errno
 import os

@@ -1,4 +1,5 @@
-"""The cages that are timed: closed, all quadrilaterals, always the same; made by whole-array operations and cached."""
+"""The cages of the benchmarks: closed, of quadrilaterals, always the same; made by whole-array operations and
+cached."""
 
 import tempfile
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What `whole_stage.py` measures of Cycles, with a Python that has Blender as a module."""
+"""The measurements of `whole_stage.py` in Cycles, with a Python that has Blender as a module."""
 
 import math
 import os

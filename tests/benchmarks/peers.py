@@ -1,4 +1,4 @@
-"""The same work by OpenSubdiv and Embree, where their development files are installed."""
+"""The same work by OpenSubdiv and Embree, if their development files are installed."""
 
 import json
 import shutil

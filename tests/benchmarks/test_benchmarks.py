@@ -22,7 +22,7 @@ def said(*words):
 
 
 @needs_llvm
-def test_benchmarks_of_the_smallest_cage_run(tmp_path):
+def test_benchmarks_run_on_the_smallest_cage(tmp_path):
     written = tmp_path / "found.json"
     words = [HERE, "--cages", "cube", "--rates", "4", "--repeats", "1", "--no-peers", "--variants", "scalar_rgb"]
     assert "cube, rate 4" in said(*words, "--cache", tmp_path, "--json", written)

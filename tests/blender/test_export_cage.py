@@ -169,7 +169,7 @@ def shown(made):
     return Usd.Stage.Open(str(usda)), points, told
 
 
-def test_points_are_those_of_a_render(shown):
+def test_points_equal_those_of_a_render(shown):
     """With render levels, hidden objects, curves, texts, instances; objects with subdivision are their cages."""
     stage, expected, told = shown
     found, cages, place = {}, {}, UsdGeom.XformCache(1)

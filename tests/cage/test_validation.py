@@ -137,7 +137,7 @@ def test_unused_vertices_are_one_warning():
     cage.with_positions(np.ones((10, 3)))
 
 
-def test_tags_reach_both_half_edges_and_no_other_and_the_last_of_equal_ones_counts():
+def test_tags_set_both_half_edges_only_and_the_last_one_counts():
     cage = tagged(cube(), creases=[(0, 1, 3), (6, 2, 20)], corners=[(7, 2.5)])
     t = cage.topology
     ends = np.sort(np.stack([t.face_vertices, t.face_vertices[t.next]]), axis=0).T
@@ -160,7 +160,7 @@ def test_creases_of_large_cages_are_found():
     np.testing.assert_array_equal(np.unique(creased, axis=0), np.unique(np.sort(wanted, axis=1), axis=0))
 
 
-def test_tags_are_read_only_and_what_is_equal_everywhere_takes_no_memory():
+def test_tags_are_read_only_and_constant_tags_take_no_memory():
     for cage in (torus(8, 6), tagged(cube(), creases=[(0, 1, 10)], corners=[(0, 10)])):
         for values in (cage.tags.edges, cage.tags.vertices):
             with pytest.raises(ValueError, match="read-only"):

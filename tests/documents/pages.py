@@ -1,4 +1,4 @@
-"""The project's pages, and what tests of them read there."""
+"""The project's pages and parsers of their contents."""
 
 import re
 import sys

@@ -1,4 +1,4 @@
-"""The documentation is built. `.ci/run` runs this file: it takes long, and needs the extra `dev`."""
+"""The documentation can be built. This test is slow and needs the extra `dev`; `.ci/run` runs it."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Every notebook of the guide runs, and what is stored in it is what its code says today."""
+"""Every notebook of the guide runs, with its stored outputs."""
 
 import re
 
@@ -38,7 +38,7 @@ def alike(one, other):
 
 
 @EVERY_NOTEBOOK
-def test_a_notebook_runs_and_shows_what_is_stored(path):
+def test_notebooks_reproduce_their_stored_outputs(path):
     """With fewer samples and steps. What these change, or the processor by its rounding, is marked as "varies"."""
     stored = nbformat.read(path, as_version=4)
     run = executed(nbformat.read(path, as_version=4), quick=True)

@@ -1,4 +1,4 @@
-"""The pages beside the code name what exists: files, names, links, sources, imports and numbers."""
+"""Files, names, links, sources, imports and numbers on the pages exist."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The package as indexes show it: links of its long description, and its metadata."""
+"""The package on indexes: links of its long description, and its metadata."""
 
 import re
 import runpy

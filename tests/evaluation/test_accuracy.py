@@ -51,7 +51,7 @@ def test_float32_normals_stay_right_at_every_level(exact, surface):
     assert np.abs(single.p - precise.p).max() <= bars.POINT_FLOAT32 * exact.size
 
 
-def test_published_forms_give_the_same_points_and_far_from_the_extraordinary_one_all_else(exact, surface):
+def test_published_forms_agree_in_points_and_away_from_the_extraordinary_point(exact, surface):
     for evaluator in ("power", "stam") if exact.valence <= 8 else ():
         samples = surface.evaluate(0, exact.uv, evaluator=evaluator)
         assert np.abs(samples.p - exact.p).max() <= POINT * exact.size

@@ -108,7 +108,7 @@ CORNERS = {
 
 @pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
 @pytest.mark.parametrize(("ends", "corner"), CORNERS.values(), ids=CORNERS.keys())
-def test_the_normal_at_a_corner_of_a_plane_is_that_of_the_plane(scheme, ends, corner):
+def test_the_normal_at_a_corner_of_a_plane_is_the_planes(scheme, ends, corner):
     flat = sheet(4, 4, triangles=scheme == "loop")
     # Turned, so that the edges of the corner are parallel but for rounding where they are.
     turn, _ = np.linalg.qr(np.array([[1, 2, 3], [0, 1, 5], [2, 0, 1]]))
@@ -160,7 +160,7 @@ def test_cut_sides_keep_faces_and_half_edges_and_uncreased_cages_are_not_cut():
         ({"holes": range(6)}, "all 6 faces are holes"),
     ],
 )
-def test_wrong_tags_are_errors_that_say_where(options, message):
+def test_errors_of_wrong_tags_name_their_place(options, message):
     with pytest.raises(CageError, match=re.escape(message)):
         ControlCage(cube().positions, faces_of(cube()), **options)
 

@@ -1,4 +1,4 @@
-"""Where surfaces are folded or collapse to curves and points: normals are unit, or exactly zero, on every path."""
+"""Normals of surfaces that are folded or collapse to curves and points are unit or exactly zero, by every method."""
 
 import drjit as dr
 import numpy as np
@@ -124,7 +124,7 @@ def test_each_side_of_a_sharp_rim_has_its_normal(size, make):
 
 @EVERY_SIZE
 @EVERY_BEND
-def test_a_lone_sharp_edge_or_corner_on_a_fold_has_normals_along_it_and_none_at_its_ends(size, bend):
+def test_lone_sharp_edges_on_a_fold_have_normals_except_at_their_ends(size, bend):
     cage = pillow(size, bend, creases=[(0, 1, INFINITE)])
     assert_unit_or_zero_alike(normals_on_every_path(cage)[0])
     # Face 0 begins with the edge; a quadrilateral's is one piece, another polygon's first half begins at corner 0.

@@ -185,7 +185,7 @@ DOES_NOT_CONTRACT = "the second eigenvalue has modulus 1.*; expected below 1, or
         *((similar(np.diag([1, second, 0.5])), DOES_NOT_CONTRACT) for second in (1, -1, 1 + 1e-3)),
     ],
 )
-def test_matrix_it_cannot_handle_is_an_error(matrix, message):
+def test_unsupported_matrices_are_errors(matrix, message):
     with pytest.raises(EigenbasisError, match=message):
         eigenbasis(matrix)
 
@@ -197,7 +197,7 @@ def test_a_matrix_that_contracts_slowly_has_a_basis():
 
 @pytest.mark.parametrize("gap", 10.0 ** -np.arange(2, 14))
 @pytest.mark.parametrize(("size", "seed"), [(2, 1), (3, 0), (3, 1), (3, 2)])
-def test_a_basis_of_a_nearly_defective_matrix_holds_or_the_error_says_where(gap, size, seed):
+def test_bases_of_nearly_defective_matrices_are_right_or_errors_name_eigenvalues(gap, size, seed):
     """Eigenvalues apart by more than rounding splits defective ones, with vectors that are nearly parallel.
 
     Rounding moves those of a triple by 1e-5, and inverse iteration may be shifted onto one of them.

@@ -32,7 +32,7 @@ def test_old_and_new_points_of_one_refinement_are_as_many_as_published(valence):
         assert whole.patch.signature == patch.signature
 
 
-def test_tiles_that_are_divided_alike_are_the_same():
+def test_tiles_of_equal_division_are_shared():
     (element,) = patch_trees(*classes(surface_named("cube")))
     tile, again = (part_of_tile(element, np.eye(element.control_count))[0] for _ in range(2))
     assert tile is again

@@ -104,7 +104,7 @@ class LastingCreases(CatmullClark):
 
 
 @pytest.mark.parametrize("use", [lambda s: s.evaluate(np.arange(6), np.zeros((6, 2))), lambda s: s.tessellate(2)])
-def test_a_scheme_that_keeps_creases_semi_sharp_is_refused(use):
+def test_schemes_with_permanent_semi_sharp_creases_are_refused(use):
     surface = LimitSurface(tagged(cube(), creases=[(0, 1, 2.5)]), LastingCreases())
     with pytest.raises(SchemeError, match="18 refinements leave something of a face semi-sharp"):
         use(surface)

@@ -1,4 +1,4 @@
-"""The dark spot as numbers: luminance around the extraordinary vertex of the two scenes, and normal error by level."""
+"""The dark spot in numbers: luminance around the extraordinary vertex of two scenes, and normal error by level."""
 
 from functools import cache
 from pathlib import Path

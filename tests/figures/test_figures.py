@@ -77,7 +77,7 @@ def coarse(monkeypatch):
             monkeypatch.setattr(f"mitsuba_subdivision.figures.{module}.{name}", value)
 
 
-def test_the_command_line_knows_every_figure_and_the_table_every_function_that_draws():
+def test_command_line_and_table_list_every_figure():
     for name in (*FIGURES, "all"):
         assert parser().parse_args(["figure", name]).name == name
     paths = Path(peers.__file__).parent.glob("*.py")
@@ -92,7 +92,7 @@ def test_all_panels_have_a_place(tmp_path, width, count):
     assert 0 <= np.prod(rows_of(FigureOptions(tmp_path, width=width), count)) - count < 2
 
 
-def test_figures_of_users_leave_a_checkout_as_it_is():
+def test_figures_of_users_do_not_change_a_checkout():
     """The first command of the README draws to a folder that git ignores, as long as nobody names another one."""
     output = parser().parse_args(["figure", "artifact"]).output
     root = Path(__file__).resolve().parents[2]
@@ -263,13 +263,13 @@ def test_scalar_variants_draw_too_all_but_fits(options):
 
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
-def test_the_distance_of_surfaces_is_that_of_spheres():
+def test_the_distance_of_spheres_is_the_difference_of_their_radii():
     """Of two spheres around one point, the difference of their radii, but for gaps between samples."""
     inner, outer = (fit.ball_cage(4, radius) for radius in (0.5, 0.6))
     assert fit.distances(outer, [inner])[0] * fit.DIAGONAL == pytest.approx(0.1, rel=0.03)
 
 
-def test_numbers_stand_on_edges_that_the_camera_sees():
+def test_numbers_are_on_visible_edges():
     seen = fit.in_front(cube(), np.array([5.0, -6, 4]))
     hidden = cube().positions[cube().edges[~seen]]
     # Those that meet in the corner across.
@@ -313,7 +313,7 @@ def test_missing_programs_are_omitted_from_figures_with_a_message(options, capsy
         assert 'no program "osd_peer"' in capsys.readouterr().err
 
 
-def test_each_panel_of_creases_has_tags_of_its_own():
+def test_each_panel_of_creases_has_its_tags():
     cage = ControlCage.from_file(example_file("cages/rook.obj"))
     smooth, tagged, infinite = (cages._tagged(cage, name).tags.edges for name in cages.TITLES)
     assert not smooth.any()
@@ -429,7 +429,7 @@ def test_programs_are_found_where_the_user_says(name, tmp_path, monkeypatch, ans
 
 
 @pytest.mark.posix
-def test_a_failing_program_says_why(answering):
+def test_failing_programs_report_the_reason(answering):
     with pytest.raises(FigureError, match="osd_peer fails: no such cage"):
         peers.osd_samples(answering("osd_peer", "echo no such cage >&2; exit 1"), cube(), 0, [[0.0, 0.0]], "far", 2)
     for text in ("echo no such module >&2; exit 1", "echo no such module >&2"):
@@ -438,7 +438,7 @@ def test_a_failing_program_says_why(answering):
 
 
 @pytest.mark.posix
-def test_samples_of_opensubdiv_are_those_it_answers(tmp_path, answering):
+def test_opensubdivs_samples_are_its_answers(tmp_path, answering):
     answers = {"p": [1.0, 2, 3, 4, 5, 6], "du": [2.0, 0, 0, 0, 0, 0], "dv": [0, 3.0, 0, 1, 0, 0]}
     answers = peers.as_bytes({name: np.array(values) for name, values in answers.items()})
     program = answering("osd_peer", "", answers)
@@ -453,7 +453,7 @@ def test_samples_of_opensubdiv_are_those_it_answers(tmp_path, answering):
 
 
 @pytest.mark.posix
-def test_the_mesh_of_blender_is_the_one_it_answers(tmp_path, answering):
+def test_blenders_mesh_is_its_answer(tmp_path, answering):
     points, normals = np.arange(12.0), np.tile([0.0, 0, 1], 4)
     answers = {"p": points.tolist(), "n": normals.tolist(), "corners": [0, 1, 2, 3], "version": [3, 4, 1]}
     # The last three words are both files and the level.

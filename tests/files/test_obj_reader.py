@@ -311,7 +311,7 @@ WRONG_TAGS = [
 
 
 @pytest.mark.parametrize(("tag", "message"), WRONG_TAGS)
-def test_wrong_tags_are_errors_that_name_their_line_in_few_words(read, tag, message):
+def test_errors_of_wrong_tags_are_short_and_name_their_line(read, tag, message):
     with pytest.raises(CageError, match=f'cage.obj", line 9: {message}') as caught:
         read(f"t {tag}\n")
     assert len(str(caught.value)) < 600

@@ -85,7 +85,7 @@ def test_rules_have_the_names_of_tokens_in_snake_case_and_arguments_override_the
     assert read(scheme="catmull_clark").scheme == "catmull_clark"
 
 
-def test_contents_that_name_no_rules_are_written_with_the_usual_ones(tmp_path):
+def test_contents_without_rules_are_written_with_defaults(tmp_path):
     """As a cage has them that is given none; USD's own differ."""
     write_usd(replace(cube().contents, rules={}), tmp_path / "cube.usda")
     again = ControlCage.from_file(tmp_path / "cube.usda")
@@ -442,7 +442,7 @@ def read_all(tmp_path):
     return read_all
 
 
-def test_the_surface_of_joined_meshes_is_that_of_each(read_all):
+def test_joined_meshes_keep_their_surfaces(read_all):
     whole = LimitSurface(read_all(STRIP, HOUSE))
     assert (whole.cage.face_count, whole.cage.holes.tolist()) == (4, [1])
     # Face 1 is a hole.

@@ -115,7 +115,7 @@ def test_a_mesh_becomes_a_cage(target):
     assert distance(LimitSurface(cage), target) < 2 * triangles / size
 
 
-def test_a_checkpoint_resumes_its_fit_and_no_other(target, tmp_path):
+def test_a_checkpoint_resumes_only_its_fit(target, tmp_path):
     points = target.sample(300, 1).p
     whole, begun, again = (PointFit(moved(target.cage), points, refine=[2]) for _ in range(3))
     whole.run(5)

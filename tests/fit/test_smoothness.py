@@ -73,7 +73,7 @@ def surface():
     return LimitSurface(torus(6, 5))
 
 
-def test_a_step_is_that_of_mitsuba(surface, np_rng):
+def test_large_steps_equal_mitsubas(surface, np_rng):
     """For a cage of triangles, whose edges are those of Mitsuba's mesh; its coordinates have another order."""
     pytest.importorskip("cholespy")
     if os.environ.get("GUARDED_ARRAYS"):

@@ -1,4 +1,4 @@
-"""Surfaces that between them have every kind of piece, and locations on them."""
+"""Surfaces with all kinds of pieces, and locations on them."""
 
 from functools import lru_cache
 from pathlib import Path

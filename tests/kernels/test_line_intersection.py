@@ -21,7 +21,7 @@ ON_RAY = {DOUBLE: 2e-6, SINGLE: 5e-6}
 
 @pytest.mark.core
 @pytest.mark.parametrize(("name", "variant"), [*((name, DOUBLE) for name in HIT), ("loop corner", SINGLE)])
-def test_rays_meet_the_points_that_they_are_aimed_at(name, variant, np_rng):
+def test_rays_hit_their_target_points(name, variant, np_rng):
     surface, kernel = surface_named(name), kernel_named(name, variant)
     target, o, d, start = aimed(surface, np_rng, 1000)
     hits = hit(kernel, o, d, *start)

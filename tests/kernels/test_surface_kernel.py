@@ -132,7 +132,7 @@ def test_corner_normals_hold_only_at_the_corner(name, np_rng):
 
 @pytest.mark.core
 @pytest.mark.parametrize("name", ["hexagon", "valence 50", "sheet", "loop corner", "doo_sabin mixed torus"])
-def test_derivatives_of_normals_are_those_of_the_surface(name, np_rng):
+def test_derivatives_of_normals_equal_the_surfaces(name, np_rng):
     surface = surface_named(name)
     locations = random_locations(surface, np_rng, 500, deepest=4)
     samples = evaluated(kernel_named(name, DOUBLE), *locations, derivatives=2)

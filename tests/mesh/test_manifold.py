@@ -1,4 +1,4 @@
-"""Cages that are no oriented manifold. That their surfaces are OpenSubdiv's is tested beside OpenSubdiv, in peers."""
+"""Cages that are no oriented manifolds. `tests/peers` compares their surfaces with OpenSubdiv's."""
 
 import re
 import warnings
@@ -37,7 +37,7 @@ def test_manifold_cages_do_not_warn():
             assert changed(cage, strict=True).non_manifold is None
 
 
-def test_pages_run_along_their_spine_and_its_ends_and_where_a_crease_meets_it_are_corners():
+def test_pages_are_creased_along_their_spine_with_corners_at_its_ends_and_creases():
     cage, creased = book(3), book(3, creases=[(1, 5, 10)])
     assert rules(cage, 0) == 3 * [VertexRule.CORNER]
     assert set(rules(creased, 1)) == {VertexRule.CORNER}
@@ -79,7 +79,7 @@ def test_faces_against_their_neighbours_are_turned(faces):
     assert volume(cage) == pytest.approx(volume(cube()), rel=1e-12)
 
 
-def test_as_few_faces_are_turned_as_possible_and_each_piece_by_itself():
+def test_the_fewest_faces_of_each_piece_are_turned():
     one, count = torus(5, 4), torus(5, 4).face_count
     other = np.vstack([one.positions, one.positions + 5])
     second = np.array(turned_over(one, set(range(count)) - {2})) + one.vertex_count
@@ -201,7 +201,7 @@ def test_each_fan_at_a_shared_vertex_has_its_own_surface_under_doo_sabin():
 
 
 @pytest.mark.parametrize(("triangles", "mode"), [*((False, m) for m in MODES[:5]), *((True, m) for m in MODES[2:5:2])])
-def test_values_of_pages_are_held_where_they_differ_along_the_spine(triangles, mode, np_rng):
+def test_values_that_differ_along_the_spine_of_pages_stay(triangles, mode, np_rng):
     """Each page's values are the surface of the page alone, with corners at both ends of every edge that is torn."""
     pages, spine, scheme = 3, 4, "loop" if triangles else "catmull_clark"
     cage = book(pages, triangles=triangles)

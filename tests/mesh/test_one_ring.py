@@ -109,7 +109,7 @@ def test_corners_of_sharpness_ten_are_not_semi_sharp(sharpness):
     assert at_corner.is_semi_sharp == (sharpness < 10)
 
 
-def test_face_across_one_edge_is_one_face_whichever_way_it_is_reached():
+def test_a_face_is_the_same_from_both_ends_of_its_edge():
     # The triangle has two edges in common with the element; its third leads to the same face from either end.
     topology = cube_with_valence_2(beside_triangle=True).topology
     (a, _, c, d), triangle, beyond = polygons(topology)[:3]

@@ -31,7 +31,7 @@ def test_values_of_different_keys_are_made_at_the_same_time(pool):
     assert len(set(values)) == THREADS
 
 
-def test_a_value_that_several_threads_request_is_made_once(pool):
+def test_concurrent_requests_make_a_value_once(pool):
     all_request, made = Barrier(THREADS), []
 
     def make():
@@ -54,14 +54,14 @@ def test_a_value_is_kept_while_it_is_referenced():
     assert shared_by_key("key", lambda: other) is other
 
 
-def test_a_value_that_could_not_be_made_is_tried_again():
+def test_failed_values_are_tried_again():
     with pytest.raises(ZeroDivisionError):
         shared_by_key("key", lambda: 1 // 0)
     value = _Value()
     assert shared_by_key("key", lambda: value) is value
 
 
-def test_making_a_value_may_request_others():
+def test_values_may_depend_on_other_values():
     inner = _Value()
     assert shared_by_key("outer", lambda: shared_by_key("inner", lambda: inner)) is inner
 

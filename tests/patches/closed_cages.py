@@ -1,4 +1,4 @@
-"""Closed control cages that between them have every feature a scheme has to cope with."""
+"""Closed control cages with all features that schemes must support."""
 
 from itertools import pairwise
 

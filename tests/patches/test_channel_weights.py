@@ -64,7 +64,7 @@ def test_values_of_doo_sabin_are_weights_times_the_cages(np_rng):
 
 @pytest.mark.parametrize("mode", ["corners_only", "corners_plus1", "corners_plus2", "boundaries"])
 @pytest.mark.parametrize("name", ["quadrilaterals", "boundary", "triangles"])
-def test_values_of_faces_cut_from_each_other_are_linear(name, mode, np_rng, monkeypatch):
+def test_values_of_separated_faces_are_linear(name, mode, np_rng, monkeypatch):
     """As their subdivision has it, which is the other path."""
     made, options = CAGES[name]
     cage = with_attributes(made(), np_rng, face_varying=mode, **options)
@@ -80,7 +80,7 @@ def test_values_of_faces_cut_from_each_other_are_linear(name, mode, np_rng, monk
     np.testing.assert_allclose(direct.evaluate(start, uv), subdivided.evaluate(start, uv), rtol=0, atol=ROUNDING)
 
 
-def test_values_of_faces_cut_from_each_other_are_subdivided_where_that_is_not_linear(np_rng):
+def test_values_of_separated_faces_are_subdivided_under_nonlinear_schemes(np_rng):
     """Without corners there, and around the middle of polygons."""
     polygons = with_attributes(mixed_torus(), np_rng)
     for cage in (with_attributes(named_cages.cube(), np_rng, face_varying="none"), polygons):

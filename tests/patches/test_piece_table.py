@@ -1,4 +1,4 @@
-"""What piece tables keep and share; that their polynomials are the surface is tested by kernels that read them."""
+"""Contents and sharing of piece tables; tests of kernels compare their polynomials with the surface."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Cages with every feature that OpenSubdiv has, alone and together, small enough to be refined deeply."""
+"""Cages with all features of OpenSubdiv, alone and together, small enough for deep refinement."""
 
 import numpy as np
 from mitsuba_subdivision import Attribute, ControlCage

@@ -1,4 +1,4 @@
-"""Faces thrown together at random, which share edges and vertices in every way, against OpenSubdiv (3.5.0)."""
+"""Random faces, which share edges and vertices in every way, compared with OpenSubdiv (3.5.0)."""
 
 import numpy as np
 import pytest

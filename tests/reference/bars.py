@@ -1,4 +1,4 @@
-"""The bars that the project sets its evaluators; measured values are 10 to 1000 times smaller (`tests/accuracy.py`)."""
+"""Limits of errors of the evaluators; measured values are 10 to 1000 times smaller (`tests/accuracy.py`)."""
 
 # Relative to the size of the cage; derivatives also divided by their size at a level, (2 lambda_2)^n.
 POINT = 1e-13

@@ -1,4 +1,4 @@
-"""Laws of the brute-force reference itself. Its limits are the package's, which are compared with published numbers."""
+"""Laws of the brute-force reference. Its limits equal the package's, which are compared with published numbers."""
 
 from decimal import Decimal
 

@@ -1,4 +1,4 @@
-"""A cage refined once has the same surface, and its points are those that the rules make, vertex by vertex."""
+"""A cage refined once has the same surface, and its points follow the rules, vertex by vertex."""
 
 import re
 import warnings
@@ -110,7 +110,7 @@ def test_any_control_points_have_the_same_surface_through_the_matrix(np_rng):
     assert largest_difference(before, after, refinement, np_rng) <= ROUNDING
 
 
-def test_vertices_keep_their_numbers_and_faces_know_where_they_lie():
+def test_vertices_keep_their_numbers_and_faces_their_parents():
     cage = mixed_torus()
     refinement = cage.refinement()
     fine, t = refinement.cage, cage.topology
@@ -168,7 +168,7 @@ def test_values_without_seams_are_refined_under_doo_sabin(np_rng):
         varying.refined("doo_sabin")
 
 
-def test_the_rule_for_seams_changes_where_that_keeps_corners(np_rng):
+def test_the_rule_for_seams_changes_to_keep_corners(np_rng):
     # Of two islands at a vertex, one is smooth after a refinement, and would be sharpened by the other from then on.
     cage = with_islands(fan(6, creases=[(0, 2, 0.5), (0, 5, 2.0)]), [(0, 1), (0, 4)], "corners_plus1")
     after = check_refined(LimitSurface(cage), np_rng)

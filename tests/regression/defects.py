@@ -1,4 +1,4 @@
-"""Defects put into a scene on purpose, small enough that nobody would see most of them."""
+"""Deliberate defects of a scene, mostly too small to see."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -44,7 +44,7 @@ def test_a_scene_against_its_reference(folder, capsys):
     assert [line.split()[:2] for line in lines[1:4]] == [["probe", "pass"], ["paired", "pass"], ["tile", "pass"]]
 
 
-def test_another_image_fails_and_says_where_even_if_no_report_can_be_written(folder, capsys, tmp_path, monkeypatch):
+def test_different_images_fail_with_their_place_even_without_a_report(folder, capsys, tmp_path, monkeypatch):
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda *_, **__: None)
     words = ["reference.exr", "stam.exr", "--html", str(tmp_path / "report")]
     assert compare(folder, *words) == 2
@@ -65,7 +65,7 @@ def test_json_on_standard_output_or_in_a_file(folder, capsys, tmp_path):
     assert printed["status"] == "pass"
 
 
-def test_a_warning_has_a_status_of_its_own(folder, tmp_path, monkeypatch):
+def test_warnings_have_their_own_exit_status(folder, tmp_path, monkeypatch):
     # The scene has changed, and so has the machine: the tile tier cannot tell, at this tolerance.
     monkeypatch.setattr(variants, "_processor", lambda: "another")
     changed = (SCENES / "valence3.xml").read_text().replace('value="0.72, 0.66', 'value="0.7201, 0.66')
@@ -169,7 +169,7 @@ def test_a_missing_pass_warns(passes, capsys, tmp_path):
         assert told == f"mitsuba-subdivision: warning: of 3 passes, these are missing: {missing}\n"
 
 
-def test_a_reference_that_is_not_finite_is_not_written(tmp_path, capsys, monkeypatch):
+def test_non_finite_references_are_not_written(tmp_path, capsys, monkeypatch):
     pixels = np.ones((16, 16, 3), np.float32)
     pixels[3, 5, 1] = np.nan
     monkeypatch.setattr("mitsuba_subdivision.regression.renders.render_pixels", lambda *_, **__: pixels)
@@ -187,7 +187,7 @@ def test_each_seed_has_other_samples(folder, tmp_path):
     assert samples[0] == samples[1] != samples[2]
 
 
-def test_merged_passes_need_room_for_their_variance_and_a_file_of_their_own(passes, capsys, tmp_path):
+def test_merged_passes_need_an_openexr_file_other_than_their_inputs(passes, capsys, tmp_path):
     before = (passes / "1.exr").read_bytes()
     assert merge(tmp_path / "merged.png", passes / "1.exr") == 3
     assert 'merged.png"; expected a name ending in .exr' in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The tiers on images made of numbers, where the truth is known."""
+"""The tiers on synthetic images, whose truth is known."""
 
 import math
 import re
@@ -64,7 +64,7 @@ def brighter(factor, *part):
 
 
 @pytest.mark.parametrize(("first", "second"), [(4, 4), (4, 16), (400, 4)])
-def test_the_relative_error_of_noise_is_the_one_expected(first, second, np_rng):
+def test_the_relative_error_of_noise_has_its_expectation(first, second, np_rng):
     """Whatever the numbers of samples: the variance of a difference is the sum of both."""
     images = (random_image(np_rng, first, "reference"), random_image(np_rng, second, "test"))
     (line,) = compare(*images).notes
@@ -246,7 +246,7 @@ def test_probes_that_hit_nothing_are_alike(reference, np_rng):
     assert result.status is Status.PASS
 
 
-def test_normals_at_silhouettes_do_not_count_and_from_the_third_pixel_on_they_do(judged):
+def test_normals_count_from_the_third_pixel_beside_silhouettes(judged):
     """A silhouette is each pixel beside one of another shape; the eight neighbours of these do not count either."""
     shape = dome().shape
     rim = np.zeros(shape.shape, dtype=bool)

@@ -34,7 +34,7 @@ def test_metadata_keep_their_digits_and_their_order_does_not_change_the_bytes(tm
     assert read_channels(tmp_path / "a.exr")[1] == metadata
 
 
-def test_any_file_with_r_g_b_is_an_image_and_standard_error_is_where_it_was_after_reading(tmp_path):
+def test_any_rgb_file_is_an_image_and_reading_restores_standard_error(tmp_path):
     before = os.fstat(2)
     write_exr(tmp_path / "a.exr", PIXELS)
     result = load_image(tmp_path / "a.exr")

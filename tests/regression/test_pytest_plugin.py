@@ -98,7 +98,7 @@ def test_update_writes_references_that_are_missing_or_damaged_or_of_another_size
     update("*12 x 12 pixels*16 x 16;*")
 
 
-def test_a_failure_is_printed_once_and_a_folder_that_is_protected_does_not_hide_it(with_reference):
+def test_failures_are_printed_once_even_without_a_writable_folder(with_reference):
     make_brighter(with_reference)
     (with_reference.path / "failures").write_text("a file")
     result = failing(with_reference)
@@ -148,7 +148,7 @@ SETTINGS = 'spp=4, reference_spp=64, batch=16, variant="scalar_rgb"'
 LENS = SCENE[SCENE.index("    <sensor") : SCENE.index("</sensor>") + len("</sensor>")]
 
 
-def test_references_belong_to_paths_parameters_and_sensors_and_old_ones_stay(with_reference):
+def test_references_are_named_by_path_parameters_and_sensor_and_old_names_work(with_reference):
     """Two scenes of one file name, one scene with two values, and its second sensor: of four tests, none shares one."""
     old = reference(with_reference).read_bytes()
     for folder, albedo in (("red", "0.3"), ("blue", "0.8")):
@@ -201,7 +201,7 @@ def test_undecided_comparisons_are_in_warnings_summary_and_junit(with_reference,
     failing(with_reference).stdout.fnmatch_lines(["*tile *fail*", "*compared all samples of the reference*"])
 
 
-def test_wrong_files_are_errors_of_one_line_before_rendering(with_reference, monkeypatch):
+def test_wrong_files_are_one_line_errors_before_rendering(with_reference, monkeypatch):
     def told(line, *options):
         result = failing(with_reference, *options)
         result.stdout.fnmatch_lines([line])

@@ -286,7 +286,7 @@ def test_images_in_parts_are_means_of_other_samples(loaded, monkeypatch):
 
 
 @pytest.mark.usefixtures("variant_scalar_rgb")
-def test_samplers_that_spread_samples_over_the_whole_keep_it(monkeypatch):
+def test_samplers_over_the_whole_image_render_it_at_once(monkeypatch):
     monkeypatch.setattr(scenes, "PART_SAMPLES", 1)
     loaded = load_scene(SCENES / "human.xml", None, "box")
     monkeypatch.setattr(mi, "render", counted := Mock(return_value=np.zeros((1, 1, 3))))
@@ -318,7 +318,7 @@ def frame_after_a_death(frame, marker, command, number):
 
 @pytest.mark.long
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
-def test_a_cluster_gives_the_bits_of_one_machine_although_a_worker_dies(tmp_path, monkeypatch, capsys):
+def test_a_cluster_gives_the_bits_of_one_machine_if_a_worker_dies(tmp_path, monkeypatch, capsys):
     distributed = pytest.importorskip("distributed")
     (tmp_path / "model.usda").write_text(MODEL)
     monkeypatch.chdir(tmp_path)

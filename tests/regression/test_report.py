@@ -62,7 +62,7 @@ def drawn(comparison, monkeypatch):
     return by_title(figures[0])
 
 
-def test_the_page_has_one_picture_runs_nothing_escapes_names_and_lies_beside_its_numbers(page):
+def test_the_page_has_one_picture_no_scripts_and_escaped_names(page):
     text = page.read_text()
     assert re.findall(r"<(script|img)\b", text) == ["img"]
     assert re.findall(r"""\b(?:href|src)=["']?(?!data:)([^"' >]+)""", text) == ["comparison.json", "maps.exr"]
@@ -93,7 +93,7 @@ def test_the_ends_of_the_scale_state_their_differences(monkeypatch):
     np.testing.assert_allclose(np.unique(picture.get_array()), picture.get_clim())
 
 
-def test_equal_pictures_are_shown_alike_and_a_circle_is_around_the_worst_pixel_of_others(failed, reports):
+def test_reports_show_equal_pictures_alike_and_circle_the_worst_pixel(failed, reports):
     panels = reports[0][1]
     reference, test = (panels[name].images[0].get_array() for name in ("Reference", "Test"))
     np.testing.assert_array_equal(reference, test)

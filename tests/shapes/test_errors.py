@@ -89,7 +89,7 @@ FOUR_TEXCOORDS = {"texcoords": np.zeros((4, 2))}
     ids=lambda value: " ".join(value)[:40] if isinstance(value, dict) else "",
 )
 @every_variant
-def test_errors_say_what_was_expected(parameters, message):
+def test_errors_name_the_expected_values(parameters, message):
     given = {"type": "subdivision", **CAGE.as_properties(mi)}
     for name, value in parameters.items():
         if isinstance(value, np.ndarray):

@@ -210,7 +210,7 @@ def test_no_facet_is_dark_on_a_convex_surface():
     assert (np.abs(seen - lit) > 0.1 * lit.max()).sum() <= 2
 
 
-def test_a_bowl_seen_from_inside_does_not_shade_itself():
+def test_a_bowl_seen_from_inside_does_not_shadow_itself():
     integrator, view = {"type": "path", "max_depth": 6}, {"origin": (0.1, -1, 3)}
     pictures = images((1, 16), bowl(), {"bsdf": matte()}, integrator, view=view, spp=64)
     seen, fine = (picture.mean(axis=2) for picture in pictures)

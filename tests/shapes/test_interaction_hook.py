@@ -230,7 +230,7 @@ for shading in ("vertex", "exact"):
 
 # Many renders, which take most of their time in answers.
 @llvm
-def test_an_interruption_is_raised_when_mitsuba_has_returned():
+def test_an_interruption_is_raised_after_mitsuba_returns():
     turns = printed(BEGIN + INTERRUPTED).splitlines()
     assert [turn.split()[0] for turn in turns] == ["vertex"] * 2 + ["exact"] * 2
 
@@ -271,7 +271,7 @@ def members(number, count):
 
 
 @llvm
-def test_instances_ask_the_shapes_of_their_own_group_only(asked):
+def test_instances_evaluate_only_shapes_of_their_group(asked):
     """Those in groups answer twice, for themselves and their group, and once in each instance; others once."""
     counts = [(1, 1, 1, 4), (1, 1, 3, 4), (1, 2, 3, 1), (2, 1, 1, 0), (2, 2, 3, 0), (3, 2, 2, 1)]
     for groups, count, instances, outside in counts:
@@ -446,7 +446,7 @@ BY_NAMES = "needs the functions of Mitsuba's bindings by their names: .*no_such_
     ],
 )
 @pytest.mark.usefixtures("variant_llvm_ad_rgb", "no_hooks")
-def test_a_shape_says_why_it_cannot_be_hooked(monkeypatch, place, value, message):
+def test_errors_state_why_a_shape_cannot_be_hooked(monkeypatch, place, value, message):
     monkeypatch.setattr(f"mitsuba_subdivision.shapes.{place}", value)
     with pytest.raises(RuntimeError, match=message):
         make()

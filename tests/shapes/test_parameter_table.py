@@ -1,4 +1,4 @@
-"""The parameter table says what the shape takes and what `traverse` shows; the plugin's page has all of it."""
+"""The parameter table lists the parameters of the shape and of `traverse`, and the plugin's page all of both."""
 
 import re
 
@@ -25,7 +25,7 @@ def shown_by(**parameters):
 
 @every_variant
 @pytest.mark.parametrize("limit", [None, "chord_error", "max_edge"])
-def test_traverse_shows_what_the_table_says(limit):
+def test_traverse_exposes_the_parameters_of_the_table(limit):
     adaptive = {} if limit is None else {"tessellation": "adaptive", limit: 0.5}
     shown = shown_by(displacement={"type": "checkerboard"}, **adaptive)
     stated = {row.name: row.flags for row in ROWS if row.flags and row.name not in set(LIMITS) - {limit}}
@@ -87,7 +87,7 @@ ENDS = {
 
 
 @pytest.mark.parametrize("row", [row for row in PARAMETERS if row.accepts is not None], ids=lambda row: row.name)
-def test_a_parameter_takes_the_numbers_that_its_message_states_and_no_others(row):
+def test_parameters_accept_exactly_the_stated_numbers(row):
     taken, refused = ENDS[row.name]
     for value in taken:
         assert row.checked(value) == value

@@ -96,7 +96,7 @@ def test_normals_of_the_published_forms_are_numbers_where_float32_overflows():
 
 
 @scalar
-def test_filename_is_relative_to_the_scene_and_a_missing_file_an_error_that_names_the_place_there(tmp_path):
+def test_filename_is_relative_to_the_scene_and_errors_name_its_place_there(tmp_path):
     for name in ("cage.obj", "folder/cage.obj"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         cube().save(tmp_path / name)
@@ -136,7 +136,7 @@ def test_a_mesh_of_a_usd_file_with_its_scheme(tmp_path):
 
 
 @every_variant
-def test_the_shape_has_its_bsdf_emitter_and_medium_and_says_what_it_is():
+def test_the_shape_has_its_bsdf_emitter_medium_and_description():
     shape = make(bsdf={"type": "dielectric"}, emitter={"type": "area"}, interior={"type": "homogeneous"})
     assert dr.all(shape.bsdf().flags() & mi.BSDFFlags.DeltaTransmission != 0)
     assert shape.is_medium_transition()
@@ -254,7 +254,7 @@ def test_far_from_the_origin_normals_stay_exact_and_points_lose_no_more_than_in_
 
 
 @every_variant
-def test_control_points_of_a_far_cage_keep_their_digits_where_they_stay():
+def test_unmoved_control_points_of_a_far_cage_keep_their_digits():
     cage = named_cages.extraordinary(5)
     shape = make(cage.with_positions(cage.positions + SHIFT))
     normals, parameters = buffer(shape, "vertex_normals"), mi.traverse(shape)

@@ -130,7 +130,7 @@ def test_an_update_of_everything_is_a_new_shape(kind, shading, monkeypatch):
 @llvm
 @shadings
 @pytest.mark.parametrize("kind", ["attribute", "adaptive bitmap"])
-def test_updates_one_after_the_other_keep_triangles_until_others_are_chosen(kind, shading):
+def test_updates_keep_triangles_until_retessellation(kind, shading):
     scene = loaded(kind, 0, shading)
     shown, (shape,) = mi.traverse(scene), scene.shapes()
     values, faces = assigned(kind, shown), np.sort(buffer(shape, "faces"))

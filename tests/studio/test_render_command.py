@@ -258,7 +258,7 @@ def test_outlines_are_within_the_error():
 
 
 @scalar
-def test_scalar_variants_keep_normals_of_vertices_and_say_so_once(capfd):
+def test_scalar_variants_keep_vertex_normals_with_one_message(capfd):
     made = msub.studio_scene(CUBE)
     assert made["surface"]["tessellation_rate"] == Model(CUBE).default_rate
     assert "shading" not in made["surface"]
@@ -274,7 +274,7 @@ def test_scalar_variants_keep_normals_of_vertices_and_say_so_once(capfd):
 @pytest.mark.parametrize("words", [["--rate", "2"], ["--turntable", "2"]])
 @llvm
 @pytest.mark.usefixtures("folder")
-def test_the_command_says_once_what_it_does_elsewhere(monkeypatch, capfd, words):
+def test_the_command_prints_one_line_about_missing_exact_shading(monkeypatch, capfd, words):
     monkeypatch.setattr(interaction_hook, "hook_problem", lambda: "needs another computer")
     assert render("cube.obj", "-o", "a.png", *TINY, *words, "-m", "llvm_ad_rgb") == 0
     assert capfd.readouterr().err.count("exact shading needs another computer\n") == 1

@@ -1,4 +1,4 @@
-"""The studio: what the camera frames, scenes of models, and scenes as XML."""
+"""The studio: framing by the camera, scenes of models, and scenes as XML."""
 
 import re
 import xml.etree.ElementTree as ElementTree
@@ -274,7 +274,7 @@ def test_the_up_axis_is_the_one_of_the_file(tmp_path):
         ({"prim": "/a"}, "prim or time was given"),
     ],
 )
-def test_errors_say_what_was_expected(arguments, message):
+def test_errors_name_the_expected_values(arguments, message):
     with pytest.raises((ValueError, CageError), match=message):
         studio_scene(named_cages.cube(), **arguments)
 

@@ -107,7 +107,7 @@ def assert_vertices_are_samples(surface, table):
 
 
 @EVERY_SURFACE
-def test_vertices_are_samples_where_they_say(name, monkeypatch):
+def test_vertices_are_samples_at_their_parameters(name, monkeypatch):
     surface = surface_named(name)
     # Odd and even, and halves of these odd and even.
     assert_vertices_are_samples(surface, surface.sampling(1 + list(SURFACES).index(name) % 6))

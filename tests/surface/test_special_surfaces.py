@@ -46,7 +46,7 @@ def test_results_do_not_depend_on_the_unit_of_length(np_rng):
     np.testing.assert_allclose(unit**2 * there.bending().data, here.bending().data, rtol=1e-9, atol=1e-12)
 
 
-def test_cages_that_are_refined_first_have_the_same_surface(np_rng, monkeypatch):
+def test_cages_refined_first_have_the_same_surface(np_rng, monkeypatch):
     cage, points = bumpy(mixed_torus(), size=0.05), np_rng.normal(size=(200, 3)) * 3
     plain = LimitSurface(cage)
     assert plain.patches.refined is None

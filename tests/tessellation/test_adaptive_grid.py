@@ -53,7 +53,7 @@ COARSE, FINE, FINE_AROUND_50 = 3e-2, 2e-3, 1e-2
     ("name", "error"),
     [(name, FINE_AROUND_50 if "50" in name else FINE) for name in SURFACES] + [(name, COARSE) for name in KINDS],
 )
-def test_triangles_have_no_cracks_and_no_folds_and_vertices_where_they_say(name, error):
+def test_triangles_have_no_cracks_and_no_folds_and_right_vertices(name, error):
     surface = surface_named(name)
     table, t = table_of(surface, error), surface.patches.elements
     # No edge occurs twice in a direction, and those without a twin lie on edges of the elements without neighbours.

@@ -1,4 +1,4 @@
-"""Cages with many classes of patches are tessellated from the cage refined once; nothing else may differ."""
+"""Cages with many classes of patches are tessellated from the cage refined once, with the same result."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Without the libraries that read stages, their tests are not collected."""
+"""Tests of stages are collected only if the libraries that read stages are installed."""
 
 from importlib.util import find_spec
 

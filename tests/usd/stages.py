@@ -1,4 +1,4 @@
-"""Text of small USD stages, what is told of them, and a sensor that looks at small scenes."""
+"""Text of small USD stages, their warnings, and a sensor for small scenes."""
 
 import warnings
 

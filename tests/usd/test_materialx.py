@@ -75,7 +75,7 @@ def material(path):
 RED = document(given("base_color", "color3", value="0.8, 0.1, 0.05"), given("specular_roughness", "float", value="0.4"))
 
 
-def test_documents_are_found_by_reference_and_layers_stay_as_they_are(stage, tmp_path, capfd):
+def test_referenced_documents_are_found_and_layers_are_unchanged(stage, tmp_path, capfd):
     """A stage that is open elsewhere keeps its layers, its edits and its reference, whose inputs are overridden."""
     over = 'over "Red" {\nfloat inputs:specular_roughness = 0.9\n}'
     for more, roughness in (([], 0.4), ([over], 0.9)):
@@ -155,7 +155,7 @@ USED = [
 ]
 
 
-def test_graphs_are_expressions_and_affine_mappings_are_those_of_pictures(stage, tmp_path, monkeypatch):
+def test_graphs_become_expressions_and_affine_maps_become_to_uv(stage, tmp_path, monkeypatch):
     monkeypatch.setattr("mitsuba_usd.textures.LEAST_PROCEDURAL", 16)
     flat(tmp_path / "color.png")
     flat(tmp_path / "normal.png", [128, 128, 255])

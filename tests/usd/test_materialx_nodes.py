@@ -127,7 +127,7 @@ def _perlin(x, y):
     return 0.6616 * total
 
 
-def test_noises_are_those_of_open_shading_language():
+def test_noises_equal_open_shading_languages():
     points = np.random.default_rng(2).uniform(-20, 20, (50, 2))
 
     def values(category, **inputs):

@@ -1,4 +1,4 @@
-"""Nodes of Mitsuba in stages, by the names of its plugins: as hdMitsuba has them."""
+"""Nodes of Mitsuba in stages, by the names of its plugins, as in hdMitsuba."""
 
 import mitsuba as mi
 import mitsuba_subdivision as msub

@@ -1,4 +1,4 @@
-"""What a picture needs: segments, points that a camera frames, copies as one shape, and images, loaded smaller."""
+"""Detail of pictures: segments, points that a camera frames, copies as one shape, and smaller images."""
 
 import struct
 import warnings
@@ -332,7 +332,7 @@ def test_results_do_not_depend_on_the_first_corner_of_a_face():
     assert needed == pytest.approx([needed[0]] * 4, rel=ROUNDED)
 
 
-def test_the_copy_that_is_largest_in_the_picture_decides():
+def test_the_largest_copy_in_the_picture_decides():
     near = np.eye(4)
     near[2, 3] = -DISTANCE / 2
     copies = {"groups": [[square()]], "instances": [InstanceContents("/i", 0, near)]}

@@ -33,7 +33,7 @@ def casteljau(points):
 
 @pytest.mark.parametrize("wrap", ["nonperiodic", "periodic", "pinned"])
 @pytest.mark.parametrize("basis", TO_BEZIER)
-def test_converted_curves_are_those_of_de_casteljau(basis, wrap):
+def test_converted_curves_equal_de_casteljaus(basis, wrap):
     step, counts = (3, [6, 9] if wrap == "periodic" else [4, 10]) if basis == "bezier" else (1, [5, 7])
     given = [np.random.default_rng(count).random((count, 4)) for count in counts]
     topology = CurveTopology(np.array(counts), basis, wrap)

@@ -1,4 +1,4 @@
-"""Whole USD files in frames, saved as scenes, and with what they have by default."""
+"""Whole USD files in frames, saved as scenes, and with defaults."""
 
 import os
 from collections import Counter
@@ -373,7 +373,7 @@ def crossing(folder, opens, closes):
     return write(folder, text)
 
 
-def test_a_shutter_blurs_a_moving_square_by_the_time_that_it_covers_a_pixel(tmp_path):
+def test_shutters_blur_a_moving_square_by_its_time_in_a_pixel(tmp_path):
     """Pixels are a quarter wide: from one of 16 sub-frames to the next, the square moves by a quarter of one."""
     left = -2 + 0.25 * np.arange(16)
     moment = np.linspace(0.25, 0.75, 20001)[:, None]
@@ -390,7 +390,7 @@ def test_a_shutter_blurs_a_moving_square_by_the_time_that_it_covers_a_pixel(tmp_
     np.testing.assert_allclose(image.mean(axis=0), covered, atol=1 / 64)
 
 
-def test_a_shutter_needs_a_time_and_a_camera_that_opens_it(tmp_path, capsys):
+def test_shutters_need_a_time_and_an_open_interval(tmp_path, capsys):
     path, cage = crossing(tmp_path, 0, 0), tmp_path / "cage.obj"
     cage.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     command = ["-m", "scalar_rgb", "-o", str(tmp_path / "x.png"), "--shutter", "2"]
@@ -448,7 +448,7 @@ def test_still_pictures_are_exact_with_outlines_for_their_camera_and_others_foll
 
 
 @scalar
-def test_scalar_variants_have_normals_of_vertices_and_say_so_once(path, tmp_path, capfd):
+def test_scalar_variants_use_vertex_normals_with_one_message(path, tmp_path, capfd):
     automatic, given = (surfaces(msub.usd_scene(path, mi, **more)) for more in ({}, {"shading": "vertex"}))
     assert [entry["tessellation_rate"] for entry in automatic[0]] == [entry["tessellation_rate"] for entry in given[0]]
     assert {entry["shading"] for entry in (*automatic[0], *automatic[1])} == {"vertex"}

@@ -1,4 +1,4 @@
-"""Models of surfaces: their energy and colour against closed forms, and against each other."""
+"""Material models: energy and colour compared with closed forms and with each other."""
 
 import math
 

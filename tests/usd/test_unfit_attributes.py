@@ -1,4 +1,4 @@
-"""Attributes of meshes that do not fit their mesh, in whole USD files."""
+"""Attributes that do not fit their mesh, in whole USD files."""
 
 import re
 from functools import partial

@@ -523,7 +523,7 @@ FROM_XYZ.append([-0.49861, 0.04156, 1.05697])
 
 @pytest.mark.parametrize(("primaries", "expected"), [(ACESCG, FROM_ACESCG), (XYZ, FROM_XYZ)], ids=["ACEScg", "XYZ"])
 @pytest.mark.parametrize("channels", ["RGB", "RGBA"])
-def test_colours_of_files_with_primaries_of_their_own_are_converted(tmp_path, primaries, expected, channels):
+def test_colours_with_other_primaries_are_converted(tmp_path, primaries, expected, channels):
     colors = np.ones((1, 4, len(channels)), np.float32)
     colors[0, 1:, :3] = np.eye(3)
     colors[0, :, 3:] = 0.5
@@ -1116,7 +1116,7 @@ def test_the_command_renders_the_whole_file(stage, tmp_path):
     brightest("--cage", status=1)
 
 
-def test_the_library_prints_nothing_itself_and_messages_of_one_kind_are_one(scene, tmp_path, capfd, monkeypatch):
+def test_usds_messages_become_one_warning_of_each_kind(scene, tmp_path, capfd, monkeypatch):
     """Warnings of C++ would name its source files; ours name each kind once, and the package that is missing."""
     monkeypatch.setattr(materialx_layers, "has_materialx", lambda: False)
     documents = "".join(f'def "m{n}" (references = @{n % 2}.mtlx@) {{}}\n' for n in range(3))

@@ -13,8 +13,7 @@ from .. import __version__
 from ..messages import PROGRAM
 from .arguments import CommandParser
 
-# ``module.function`` of this package, and a line of the program's help. Only the module of the given command is
-# imported, as some imports are slow.
+# ``module.function`` of this package, and a line of help. Only the module of the given command is imported.
 COMMANDS = {
     "figure": ("figure.figure", "draw a figure of the documentation"),
     "render": ("render.render", "render a scene, or a model in a studio"),

@@ -29,8 +29,7 @@ from .staging import around_vertices, frame, grid_points
 
 SIDE_POINTS = 24  # Points along each side of a polygon, which the map bends
 VALENCE, LEVELS = 5, 6
-# Size of labels at level 0 in points per millimetre of the figure's width; other levels have smaller ones. Indices have
-# 0.7 times the size of labels, and at least 6 points.
+# Size of labels at level 0 in points per millimetre of the figure's width. Indices have 0.7 times the size.
 LABEL_SIZE, LEAST_LABEL = 0.175, 8.6
 # The irregular child is grey, as in the figure `subdivision`; all four differ in greyscale.
 CHILD_COLOURS = ("#747b84", "#fcebbc", "#e39360", "#b3d3e0")
@@ -238,8 +237,7 @@ BEND = 0.35
 # it, where curvature may be unbounded, values do not affect colours, and there are no lines.
 RADIUS, MIDDLE = 0.95, 0.1
 LINEAR = 0.2  # Colours are linear up to this part of the largest curvature, then logarithmic
-# Lines of equal curvature relative to the largest, up to the border between both signs, slightly below zero, so that a
-# flat surface has no border.
+# Lines of curvature relative to the largest, and a border of both signs just below zero, for flat surfaces without.
 NEGATIVE = (-1 / 4, -1 / 16, -1e-3)
 FLAT = 1e-9  # Curvature below this, in reciprocals of the disc's radius, is a rounding error
 DEPTHS = np.arange(0, 41)

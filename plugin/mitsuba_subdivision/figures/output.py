@@ -29,8 +29,7 @@ PAGE, COLUMN, BETWEEN, INCH = 178.0, 84.0, 120.0, 25.4
 PAD, LAYOUTS = 0.02, 8  # Room around a figure in inches, and number of layouts until it fits
 # Sizes of text in points for a column and for a page; exponents and indices are characters of the same size.
 TEXT_SIZES = (6.0, 7.0)
-# Colours and markers of series, distinguishable in greyscale and by colour-blind readers. Red is for extraordinary
-# points.
+# Colours and markers of series, distinct in greyscale and for colour blindness; red marks extraordinary points only.
 SERIES = (("#2f8f83", "s"), ("#12395c", "o"), ("#d9a53f", "^"))
 STYLE: dict[Any, Any] = {
     "pdf.fonttype": 42,

@@ -21,8 +21,7 @@ from .output import FigureOptions, hide_frame, panels, show, write_figure
 from .peers import blender, blender_mesh, osd_peer, osd_samples
 
 LEVEL = 3  # Level of the refined mesh, typical of programs without limit surfaces
-# Level of all other surfaces, which then differ only in points and normals at the vertices; the second for a user's
-# cage, which has up to a hundred faces.
+# Level of all other surfaces, which then differ only in points and normals of vertices; and level of users' cages.
 FINE_LEVEL, OWN_LEVEL = 7, 5
 # Dark and light bands from pole to pole of the environment, and angle between their axis and the image's x axis.
 STRIPES = 84

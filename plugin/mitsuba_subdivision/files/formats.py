@@ -28,8 +28,7 @@ class Format:
     Functions are named "module:function"; the module of this package is imported on first use.
     """
 
-    # Reads `CageContents` from a path. If the format has prims, it also takes `prim`, `time` and the rules that replace
-    # the file's own, as in `ControlCage.from_file`.
+    # Reads `CageContents` from a path; if the format has prims, with arguments of `ControlCage.from_file`.
     read: str
     write: str = ""  # Takes `CageContents` and a path; empty if there is none
     write_triangles: str = ""  # Takes a path and `Triangles`; empty if there is none
@@ -41,8 +40,7 @@ class Format:
 
 _USDZ = Format("usd_reader:read_usd", has_prims=True, refers_to_files=True, up=None)
 _USD = replace(_USDZ, write="usd_writer:write_usd", write_triangles="usd_writer:write_usd_triangles")
-# Formats by suffix. Blender, Maya and Houdini write OBJ files with y up, Blender PLY files with z up. Archives
-# (".usdz") can only be read.
+# Formats by suffix. Blender, Maya and Houdini write OBJ files with y up, Blender PLY files with z up.
 FORMATS = {
     ".obj": Format("obj:read_obj", "obj:write_obj", "obj:write_obj_triangles"),
     ".ply": Format("ply:read_ply", "ply:write_ply", "ply:write_ply_triangles", up="z"),

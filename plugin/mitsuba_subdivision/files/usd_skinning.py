@@ -52,8 +52,7 @@ class Skinning:
         step = float(np.abs(points).max(initial=0)) or 1.0
         base = self._skinned(query, np.zeros_like(points))
         shifted = [self._skinned(query, np.broadcast_to(step * axis, points.shape)) - base for axis in np.eye(3)]
-        # Rows are images of the axes: for row vectors, normals are multiplied by the inverse transpose. Its adjugate
-        # exists for every map, and differs by a factor.
+        # Rows are images of the axes. Normals are multiplied by the adjugate, the inverse transpose up to a factor.
         x, y, z = shifted
         adjugate = np.stack([np.cross(y, z), np.cross(z, x), np.cross(x, y)], axis=1)
         moved = np.einsum("ni,nij->nj", normals, adjugate[corners])

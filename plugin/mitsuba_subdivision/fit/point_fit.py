@@ -21,15 +21,13 @@ from .fitting import Fit, Schedulable, Schedule, State
 from .smoothness import quadratic_form
 
 POINTS = "points: value"  # Name in checkpoints
-# Distance beyond which a part of the surface has no points nearby, in median distances between points; gaps between
-# random points are smaller.
+# Distance beyond which a part of the surface has no points nearby, in median distances between points.
 NEAR = 5.0
 DAMPING = 1e-8  # Weight of the current position of each control point, relative to the mean weight of points
 POINTS_PER_CONTROL_POINT = 8  # Default number of points on the mesh for each final control point
 
 
-# Points of the surface, as (s, n) weights of control points; targets, (s, 3); and unit normals, (s, 3), or zero, along
-# which distances have their full weight.
+# (s, n) weights of control points in points of the surface; (s, 3) targets; (s, 3) unit normals, or zero.
 Pairs = tuple[sparse.csr_array, FloatArray, FloatArray]
 
 

@@ -25,8 +25,7 @@ from ..surface import LimitSurface
 
 # Regularizers of the form ``(x - x0)^T Q (x - x0) / 2``, summed over the coordinates of control points x, and others.
 QUADRATIC, FOLDS = ("laplacian", "bending", "anchor"), "folds"
-# Cosine of the least penalised angle between normals, 107 degrees: at the tips of growing parts, faces turn by a right
-# angle and more.
+# Cosine of the least penalised angle, 107 degrees: at tips of growing parts, faces turn by a right angle and more.
 LEAST_COSINE = -0.3
 
 

@@ -119,8 +119,7 @@ def compare(
     tiers: Sequence[str] | None = None,
     tolerances: Tolerances | None = None,  # By default those stored with the reference
     suite_size: int = 1,  # Number of scenes that share the probability of a false alarm
-    # Effect of channels of only one image, in `MISSING`. A warning by default: a new layer does not change the picture,
-    # but is not compared.
+    # Effect of channels of only one image, in `MISSING`: a new layer does not change the picture, but is not compared.
     missing: str = "warn",
 ) -> Comparison:
     """Compare a test with a reference.

@@ -26,8 +26,7 @@ NOTHING = 2**32 - 1  # Index of no shape, triangle or element
 Channels = dict[str, NDArray]
 
 RGB = ("R", "G", "B")
-# Channels of a probe's fields; those of one channel are indices. They begin with `_OF_PROBE`, except in files of older
-# versions.
+# Channels of a probe's fields, indices if single. They begin with `_OF_PROBE`, except in files of older versions.
 _OF_PROBE = "probe_"
 _PROBE = {"position": ("P.X", "P.Y", "P.Z"), "normal": ("Ns.X", "Ns.Y", "Ns.Z"), "uv": ("uv.U", "uv.V")}
 _PROBE |= {"shape": ("shape",), "triangle": ("prim",), "element": ("element",)}

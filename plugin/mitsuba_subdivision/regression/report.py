@@ -28,8 +28,7 @@ MOST_OTHERS = 4  # Panels of channels besides R, G and B
 COLUMNS, PANEL_INCHES, DOTS_PER_INCH = 4, 2.9, 160
 ANGLES = (1e-5, 10.0)  # Degrees of the first and of the last colour
 _SIGNED = "RdBu_r"
-# Title, caption and colours of each map; least range of the colours, so that rounding stays pale; percentile at their
-# end.
+# Title, caption, colours, least range of the colours (so that rounding stays pale), and percentile at their end.
 _MAPS = {
     "relative": ("Relative difference", "(test - reference) / reference,\nmean of R, G, B", _SIGNED, 0.01, 99.0),
     "paired": ("Paired difference", "from the same samples, so\nwithout noise", _SIGNED, 0.01, 99.0),

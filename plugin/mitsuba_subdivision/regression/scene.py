@@ -22,8 +22,7 @@ BOX = "box"
 
 # Path of an XML file, dictionary, or mi.Scene. As text, as Mitsuba has no classes before a variant is set.
 SceneSource = Union[str, Path, Mapping[str, Any], "mi.Scene"]
-# Samples of a part, and least samples per pixel: with fewer, weights of a wide reconstruction filter would differ
-# between parts.
+# Samples of a part, and least samples per pixel: with fewer, weights of a wide filter would differ between parts.
 PART_SAMPLES = 1 << 22
 LEAST_PART_SPP = 16
 SEEDS = 2**32  # Seeds of Mitsuba have 32 bits
@@ -127,8 +126,7 @@ def _parsed_scene(
                 _replace_filter(state, filter_name)
             # If meshes are merged, addresses in memory decide the order of area lights, and so the random numbers.
             config.merge_meshes = False
-            # Parallel loading numbers shapes in random order, which changes kernels of instances: some processes would
-            # compile them again.
+            # Parallel loading numbers shapes in random order, which changes kernels of instances.
             config.parallel = not any(node.props.plugin_name() == "instance" for node in state.nodes)
             mi.parser.transform_all(config, state)
             made = mi.parser.instantiate(config, state)

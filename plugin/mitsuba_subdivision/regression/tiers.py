@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from . import RegressionError
 from .image import Estimate, Image, without_sample_counts
 
-# Names and descriptions.
 TIERS = {
     "probe": "what the rays through the centres of the pixels hit",
     "paired": "pixels from the same samples, which must be the same",

@@ -34,8 +34,7 @@ CHECKER_SQUARES = 16  # Squares along a texture coordinate from 0 to 1
 # Attributes that replace the colour of clay: of PLY files, and of USD's meshes.
 COLOURS = ("color", "displayColor")
 WIRE_COLOUR, WIRE_RATE = (0.015, 0.05, 0.12), 2
-# Radius of rods relative to the model's radius, its maximum relative to the median edge, and radius of balls relative
-# to rods.
+# Radius of rods relative to the model's, its maximum relative to the median edge; radius of balls relative to rods.
 ROD, ROD_PER_EDGE, BALL = 0.0045, 0.05, 2.2
 # Radii of the round limit surfaces of square tubes and of cubes, relative to the distance of a corner.
 _TUBE_LIMIT, _CUBE_LIMIT = 2 / 3, 1 / 2

@@ -37,18 +37,15 @@ MARGIN = 0.08  # Empty part of the picture on each side
 NEAREST = 0.25
 DEFAULT_SIZE, DEFAULT_SPP, LARGEST_SIDE = (640, 480), 64, 1 << 14
 SIZES = (1e-9, 5e8)  # Measured range of sizes that Mitsuba renders alike: it squares lengths in single precision
-# Largest side of models to enlarge, and least side after that: Mitsuba offsets rays from surfaces by 9e-5 of a unit, or
-# of larger coordinates.
+# Largest side of models to enlarge, and least side after that: Mitsuba offsets rays by 9e-5 of a unit.
 SMALL, LARGE_ENOUGH = 1.0, 8.0
 LARGEST_BOX = 1e37  # Side of the largest box that is finite in single precision
-# Lights for a camera in front: positions (right, back, up) from the middle and half sides, both in radii of the model,
-# radiance, and sampling weights of least noise.
+# Position (right, back, up) and half sides in radii of the model, radiance, and sampling weight of least noise.
 LIGHTS = {
     "key_light": ((-4.4, -1.9, 4.4), (1.5, 1.5), (16.0, 15.4, 14.6), 3.0),
     "fill_light": ((5.5, -4.0, 1.6), (2.5, 2.5), (0.55, 0.58, 0.62), 0.25),
     "rim_light": ((3.6, 4.4, 3.8), (1.6, 1.6), (8.5, 9.0, 9.6), 2.0),
 }
-# Lights and backdrop.
 STUDIO = (*LIGHTS, "ambient_light", "ground")
 ENVIRONMENT = "environment"
 # Entries that turn with the camera.
@@ -60,8 +57,7 @@ AOVS |= {name: name for name in ("duv_dx", "duv_dy", "prim_index", "shape_index"
 AOVS |= {"normal": "sh_normal", "normals": "sh_normal", "N": "sh_normal", "Ng": "geo_normal", "P": "position"}
 AOVS |= {"z": "depth", "st": "uv", "primId": "shape_index", "instanceId": "shape_index", "elementId": "prim_index"}
 LENGTHS = ("depth", "position", "dp_du", "dp_dv")
-# Distances in radii: of the backdrop's bend and wall from the model's middle; of the floor from the model, as a flat
-# model must not coincide with it.
+# Distances in radii: of the backdrop's bend and wall from the model's middle, and of the floor from the model.
 BEND, WALL, GAP = 1.6, 7.0, 0.003
 
 
