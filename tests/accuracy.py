@@ -45,7 +45,6 @@ def main() -> int:
     parser.add_argument("--high", action="store_true", help="valences 200, 500 and 1000 instead")
     high = parser.parse_args().high
     warnings.simplefilter("error")
-
     print(f"{'':20}" + "".join(f"{name:>12}" for name in COLUMNS))
     worst: dict[str, float] = {}
     for scheme in SCHEMES:

@@ -78,8 +78,7 @@ def test_uploads_are_complete_for_other_threads(variant_llvm_ad_rgb):  # noqa: A
             for _ in range(20):
                 busy = dr.sin(busy)
             dr.eval(busy)
-            array = upload(mi.Float, values)
-            assert np.array_equal(pool.submit(array.numpy).result(), values)
+            assert np.array_equal(pool.submit(upload(mi.Float, values).numpy).result(), values)
 
 
 def test_arrays_of_users_are_copied_in_place_unless_they_have_derivatives(variant_llvm_ad_rgb):  # noqa: ARG001

@@ -94,7 +94,6 @@ def process(variant, kind, path, rate, write=None):
     np.array(mi.render(loaded, spp=4))
     clock.append(time.perf_counter())
     processor = time.process_time() - processor
-
     import json
 
     if write:

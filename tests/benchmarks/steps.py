@@ -17,6 +17,7 @@ import mitsuba_subdivision  # noqa: F401
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
 from processes import print_row
 
 from scenes import SIX_CAGES, scene_around, spread
@@ -37,13 +38,9 @@ def scene_of(kind, count):
 
 def mesh_of(name, shape):
     """A mesh with the triangles of a shape."""
-    given = mi.load_dict(shape)
-    mesh = mi.Mesh(name, given.vertex_count(), given.face_count(), has_vertex_normals=True)
-    source, target = mi.traverse(given), mi.traverse(mesh)
-    for key in ("vertex_positions", "vertex_normals", "faces"):
-        target[key] = source[key]
-    target.update()
-    return mesh
+    source = mi.traverse(mi.load_dict(shape))
+    buffers = {key: np.array(source[key]).reshape(-1, 3) for key in ("faces", "vertex_positions", "vertex_normals")}
+    return mitsuba_mesh(name, buffers.pop("faces"), buffers)
 
 
 def milliseconds(kind, count, repeats, *, is_frozen):

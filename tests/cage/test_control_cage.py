@@ -271,8 +271,7 @@ def test_pole_is_isolated_and_numbered_first(valence, closed):
     cage = extraordinary(valence, closed=closed)
     topology = cage.topology
     np.testing.assert_array_equal(cage.positions[0], [0, 0, 1])
-    faces = cage.face_vertices.reshape(-1, 4)
-    assert (faces[:valence, 0] == 0).all()
+    assert (cage.face_vertices.reshape(-1, 4)[:valence, 0] == 0).all()
     np.testing.assert_array_equal(topology.turn[4 * np.arange(valence)], 4 * np.roll(np.arange(valence), -1))
     # Without its lower half, it has one boundary, above the equator.
     assert (topology.twin < 0).sum() == (0 if closed else 6 * valence)

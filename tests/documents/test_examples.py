@@ -243,8 +243,7 @@ def run_blocks(page, folder):
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_every_example_of_a_page_runs(page, folder):
     names = run_blocks(page, folder)
-    written = {path.name for path in folder.rglob("*") if path.is_file()}
-    assert written >= WRITTEN.get(page.stem, set())
+    assert {path.name for path in folder.rglob("*") if path.is_file()} >= WRITTEN.get(page.stem, set())
     if page.stem == "parameters":
         # One optimisation has found the size, the other the colours.
         points = np.array(mi.traverse(names["scene"])[names["key"]])

@@ -41,10 +41,6 @@ def citations(text):
     return {key.group() for key in keys if key}
 
 
-def bibliography():
-    return set(re.findall(r"^- \*\*\[(.+?)\]\*\*", text_of(MATHEMATICS), flags=re.MULTILINE))
-
-
 @BOTH
 def test_every_file_that_a_page_names_exists(page):
     paths = {word for word in quoted(text_of(page)) if is_path(word)}
@@ -89,7 +85,7 @@ def test_every_source_that_is_cited_is_in_the_bibliography():
     assert cited >= {"Catmull and Clark 1978", "Doo and Sabin 1978", "Loop 1987", "DeRose et al. 1998"}
     body = text_of(MATHEMATICS).partition("## 16. Bibliography")[0]
     on_pages = citations(body) | {key for page in PAGES if page != MATHEMATICS for key in citations(text_of(page))}
-    assert cited | on_pages == bibliography()
+    assert cited | on_pages == {*re.findall(r"^- \*\*\[(.+?)\]\*\*", text_of(MATHEMATICS), flags=re.MULTILINE)}
 
 
 def test_the_table_of_eigenvalues_follows_the_rules():

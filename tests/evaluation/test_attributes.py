@@ -43,16 +43,12 @@ def random_locations(surface, rng, count=150):
     return element, uv, corner
 
 
-def creases_along(cage, half_edges, rng, sharpness):
-    t = cage.topology
-    return [(t.face_vertices[h], t.face_vertices[t.next[h]], rng.choice(sharpness)) for h in half_edges]
-
-
 def random_tags(cage, rng, share, sharpness=(INFINITE,)):
     t = cage.topology
     corners = np.flatnonzero(rng.random(t.vertex_count) < share / 2)
+    half_edges = t.edge_half_edge[rng.random(t.edge_count) < share]
     return {
-        "creases": creases_along(cage, t.edge_half_edge[rng.random(t.edge_count) < share], rng, sharpness),
+        "creases": [(t.face_vertices[h], t.face_vertices[t.next[h]], rng.choice(sharpness)) for h in half_edges],
         "corners": [(v, rng.choice(sharpness)) for v in corners],
     }
 

@@ -25,8 +25,7 @@ def test_old_and_new_points_of_one_refinement_are_as_many_as_published(valence):
     old = 2 * valence + 8
     assert patch.matrix.shape == (old, old)
     assert patch.children.shape == (3, 16, old)
-    new = np.unique(np.vstack([patch.matrix, *patch.children]), axis=0)
-    assert len(new) == 2 * valence + 17
+    assert len(np.unique(np.vstack([patch.matrix, *patch.children]), axis=0)) == 2 * valence + 17
     for corner in range(4):
         whole = patch_tree(SCHEME, patch.signature.rotated(corner)).piece
         assert whole.patch.signature == patch.signature

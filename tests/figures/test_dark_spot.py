@@ -114,8 +114,7 @@ def test_turned_at_random_the_stabilised_form_has_the_errors_of_single_precision
         errors.append(normal_angle(LimitSurface(cage).tessellate(4, "stabilized", np.float32).normals[0], exact))
     # Half a unit in the last place of a component near one is 2e-6 degrees.
     assert 5e-7 < np.median(errors) < 1e-5
-    error = normal_error.error_at_vertex(LimitSurface(cage), 4, "stabilized", 0.0)
-    assert error == errors[-1]
+    assert normal_error.error_at_vertex(LimitSurface(cage), 4, "stabilized", 0.0) == errors[-1]
 
 
 def test_normals_converge_at_the_rate_of_the_eigenvalues():

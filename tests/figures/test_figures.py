@@ -120,7 +120,6 @@ def test_figures_are_drawn_without_warnings_and_fit_for_print(name, options):
     again = {RENDERED_TWICE: ("exr",), WRITTEN_TWICE: figure.formats}.get(name, ())
     if again:
         assert drawn(again).items() <= first.items()
-
     pypdf = pytest.importorskip("pypdf")
     page = pypdf.PdfReader(options().output / f"{name}.pdf").pages[0]
     assert float(page.mediabox.width) == pytest.approx(COLUMN / 25.4 * 72)
@@ -329,8 +328,7 @@ def test_the_displaced_jar_has_no_step_at_its_seam_and_plain_ends():
     heights = scenes.quilt()
     assert heights.shape == (scenes.ROWS, scenes.COLUMNS)
     # The last column is as near to the first one as any two neighbours.
-    steps = np.abs(np.diff(heights, axis=1)).max()
-    assert np.abs(heights[:, 0] - heights[:, -1]).max() <= 1.01 * steps
+    assert np.abs(heights[:, 0] - heights[:, -1]).max() <= 1.01 * np.abs(np.diff(heights, axis=1)).max()
     along = (np.arange(scenes.ROWS) + 0.5) / scenes.ROWS
     assert not heights[(along < scenes.LOWEST) | (along > scenes.HIGHEST)].any()
     assert 0.9 < heights.max() <= 1
@@ -396,8 +394,7 @@ def test_projection_finds_what_the_camera_sees():
         centre = np.array([(alpha * x).sum(), (alpha * y).sum()]) / alpha.sum()
         np.testing.assert_allclose(project(scene.sensors()[0], place), centre, atol=0.1)
     towards = np.array([3, -4, 5]) / np.sqrt(50)
-    seen = visible(scene, place + 0.1 * np.stack([towards, -towards]))
-    assert seen.tolist() == [True, False]
+    assert visible(scene, place + 0.1 * np.stack([towards, -towards])).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("valence", [3, 5, 8])
@@ -411,8 +408,7 @@ def test_zoom_shows_the_errors_of_its_magnification(variant_llvm_ad_rgb):  # noq
     for magnification, wrong in ((1, 1e-2), (1_000_000, 10)):
         samples = normal_error.panel_samples(surface, magnification, 8)
         # The elements at the point cover the picture, at every magnification.
-        extent = np.abs(samples[1][:, -1, :2]).max(axis=1)
-        assert extent.min() > 0.9
+        assert np.abs(samples[1][:, -1, :2]).max(axis=1).min() > 0.9
         stam, stabilised = (normal_error.normals_by(surface, samples, name)[2] for name in ("stam", "stabilized"))
         assert stabilised < 1e-4
         assert (stam > wrong) == (magnification > 1)

@@ -118,7 +118,6 @@ def test_tables_and_lists_of_any_length_are_read(tmp_path, np_rng, byte_order, c
     content += packed("u2", [3])
     path = tmp_path / "cage.ply"
     path.write_bytes(content)
-
     with pytest.warns(CageWarning, match='"id" of faces, "none" of faces, the list "pair" of vertices, the list "one"'):
         contents = read_ply(path)
     np.testing.assert_array_equal(contents.face_sizes, corner_counts)

@@ -123,7 +123,6 @@ def test_a_checkpoint_resumes_only_its_fit(target, tmp_path):
     resumed = again.resume(tmp_path / "fit.npz").run(2)
     assert resumed.losses == whole.losses
     np.testing.assert_array_equal(resumed.control_points, whole.control_points)
-
     PointFit(torus(5, 4), points).run(1, checkpoint=tmp_path / "fit.npz")
     with pytest.raises(ValueError, match='has no "points" of this fit; expected that of a fit with the same arguments'):
         PointFit(target.cage, points).resume(tmp_path / "fit.npz")

@@ -93,12 +93,10 @@ def test_coordinates_and_points_are_inverse_and_derivatives_solve_the_same_syste
     points, steps = surface.cage.positions, LargeSteps(surface.cage.laplacian(), 3.0)
     again = steps.from_differential(steps.to_differential(points))
     np.testing.assert_allclose(np.array(again).reshape(-1, 3), points, atol=SINGLE)
-
     steps = LargeSteps(surface.stiffness(), 2.0)
     dense = np.eye(surface.cage.vertex_count) + 2.0 * surface.stiffness().toarray()
     given = np_rng.normal(size=surface.cage.positions.shape)
     expected = np.linalg.solve(dense, given)
-
     u, v = upload(mi.Float, given), upload(mi.Float, given)
     dr.enable_grad(u, v)
     dr.backward(dr.dot(steps.from_differential(u), upload(mi.Float, given)))

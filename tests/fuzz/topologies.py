@@ -221,7 +221,6 @@ def difference_to_refined(surface, rng, count=24):
         best = int(np.argmax(scheme.domain.inside(placed)))
         child[i], child_uv[i] = parts[best][1], placed[best]
     here, there = evaluate_at(surface, half_edge, uv), evaluate_at(finer, child, child_uv)
-
     lengths = np.linalg.norm([here.n, there.n], axis=2)
     zero, unit = lengths == 0, np.abs(lengths - 1) <= LENGTH
     product = np.linalg.norm(np.cross(here.dp_du, here.dp_dv), axis=1)

@@ -59,7 +59,6 @@ def test_forward_reverse_and_differences_agree(name, tessellation, mirror, np_rn
     edge = np.linalg.norm(np.diff(positions[surface.cage.edges], axis=1), axis=2).min()
     move, turn = edge * np_rng.normal(size=positions.shape), np.vstack([np_rng.normal(size=(3, 4)), np.zeros(4)])
     expected = extrapolated(lambda step: on_host(table, positions + step * move, start + step * turn))
-
     inputs = arrays.Float64(positions.ravel()), arrays.Matrix4f64(start)
     changes = arrays.Float64(move.ravel()), arrays.Matrix4f64(turn)
     derivatives = derivatives_both_ways(vertices, inputs, changes, np_rng, ROUNDING)

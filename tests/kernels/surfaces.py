@@ -127,11 +127,8 @@ def computed(results):
 
 
 def hit(kernel, o, d, *start):
-    return computed(kernel.intersect(rays_of(kernel.types, o, d), *on_device(kernel.types, *start)))
-
-
-def rays_of(types, o, d):
-    return SimpleNamespace(o=upload(types.vector3, o), d=upload(types.vector3, d))
+    ray = SimpleNamespace(o=upload(kernel.types.vector3, o), d=upload(kernel.types.vector3, d))
+    return computed(kernel.intersect(ray, *on_device(kernel.types, *start)))
 
 
 def aimed(surface, rng, count, *, steep=0.3, near=0.05, deepest=4):

@@ -35,7 +35,6 @@ def test_rows_keep_their_places_and_receive_their_derivatives(size, variants_all
     index, active = np_rng.integers(0, ROW_COUNT, 20), np_rng.random(20) < 0.7
     row = types.row(buffer, size, types.indices(index), upload(mi.Mask, active))
     np.testing.assert_array_equal(np.array(row).T, rows[index] * active[:, None])
-
     dr.enable_grad(buffer)
     weights = np_rng.integers(1, 5, (size, 20)).astype(np.float32)
     row = types.row(buffer, size, types.indices(index))

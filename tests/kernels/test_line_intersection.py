@@ -41,8 +41,7 @@ def test_rays_hit_their_target_points(name, variant, np_rng):
         lengths = 0.1 * np.linalg.norm(d, axis=1)
         line = (upload(kernel.types.vector3, array) for array in (target - 0.1 * d, d))
         _, kind, _ = computed(kernel.line_hits(*line, hits.location, max_distance=np.median(lengths)))
-        is_near = lengths < np.median(lengths)
-        assert ((np.array(kind) == ON_LINE) == is_near).mean() > 0.98
+        assert ((np.array(kind) == ON_LINE) == (lengths < np.median(lengths))).mean() > 0.98
 
 
 def met_past_a_border(kernel, surface, beyond, turns=0):
@@ -97,7 +96,6 @@ def test_rays_meet_points_next_to_extraordinary_ones_in_single_precision(cage, s
     target = surface.evaluate(element, uv, corner)
     hits = hit(kernel, target.p + 0.1 * target.n, -target.n, element, uv, corner)
     assert np.isfinite(np.array(hits.t)).mean() > 0.98
-
     start = np.clip(uv + np_rng.uniform(-0.02, 0.02, uv.shape), 0, 1)
     d = -target.n + np_rng.uniform(-0.5, 0.5, (500, 3))
     hits = hit(kernel, target.p - 2 * d, d, element, start, corner)

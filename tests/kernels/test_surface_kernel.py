@@ -198,14 +198,10 @@ DIFFERENTIATED = [
 ]
 
 
-def small_surface(name):
-    return LimitSurface(bumpy(SMALL[name][1]), SMALL[name][0]) if name in SMALL else surface_named(name)
-
-
 @pytest.mark.parametrize(("kind", "name", "order"), DIFFERENTIATED)
 def test_derivatives_are_differences_and_the_same_both_ways(kind, name, order, np_rng):
     """By control points, and by parameters, rays or points: hits stay on their rays, and nearest points near."""
-    surface = small_surface(name)
+    surface = LimitSurface(bumpy(SMALL[name][1]), SMALL[name][0]) if name in SMALL else surface_named(name)
     kernel, count = surface.on_device(DOUBLE), 80
     types = kernel.types
     element, uv, corner = random_locations(surface, np_rng, count, deepest=6 if kind == "evaluate" else 4)
@@ -225,7 +221,6 @@ def test_derivatives_are_differences_and_the_same_both_ways(kind, name, order, n
         element, uv, corner = nearest.element, nearest.uv, nearest.corner
     place, values = on_device(types, element, uv, corner), [surface.cage.positions, *others]
     ways = [np_rng.normal(size=value.shape) for value in values]
-
     tangents, curvature = {"dp_du", "dp_dv"}, {"dn_du", "dn_dv"} if order == 2 else set()
     more = {"evaluate": [*tangents, *curvature], "intersect": ["t", *tangents, *curvature], "closest": ["distance"]}
     names = ["p", "n", *sorted(more[kind])]

@@ -27,8 +27,7 @@ def test_values_of_different_keys_are_made_at_the_same_time(pool):
         all_make.wait(LIMIT)
         return _Value()
 
-    values = list(pool.map(lambda key: shared_by_key(key, make), range(THREADS)))
-    assert len(set(values)) == THREADS
+    assert len(set(pool.map(lambda key: shared_by_key(key, make), range(THREADS)))) == THREADS
 
 
 def test_concurrent_requests_make_a_value_once(pool):

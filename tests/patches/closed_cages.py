@@ -110,7 +110,6 @@ def mixed_torus():
     rows = 8
     base = torus(9, rows)
     faces = {divmod(f, rows): tuple(face) for f, face in enumerate(base.face_vertices.reshape(-1, 4).tolist())}
-
     a, b, c, f = faces.pop((1, 1))
     _, d, e, _ = faces.pop((2, 1))
     others = [(a, b, d, e, c, f)]

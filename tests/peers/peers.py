@@ -106,7 +106,6 @@ def evaluate(
     size = 3 if cage.scheme == "loop" else 4
     is_whole = cage.face_sizes[element] == size
     turned, back = _from_corner_0(size, uv, np.where(is_whole, corner, 0))
-
     creases, corners, texcoords = cage.tags.creases(cage.topology), cage.tags.corners(), cage.texcoords
     values, indices = (np.zeros((0, 0)), []) if texcoords is None else (texcoords.values, texcoords.indices)
     integers = {

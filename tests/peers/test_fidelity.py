@@ -117,7 +117,6 @@ def test_points_and_normals_at_refined_vertices(cage):
     known = np.isin(theirs.rule, (SMOOTH, CREASE, CORNER))
     assert (known | (theirs.rule == DART)).all()
     assert distance(ours.p, theirs.p)[known].max() <= POINT * rounding(cage) * box(cage)
-
     assert turned(ours, theirs)[theirs.rule == SMOOTH].max(initial=0) <= NORMAL * rounding(cage)
     if cage.non_manifold is not None:
         # At an edge of many faces the tangents of a vertex belong to none of them.
@@ -221,7 +220,6 @@ def test_faces_against_their_neighbours_differ_by_one_rule(cage, against):
     there = np.where(other_way[:, None], uv[:, ::-1], uv), np.where(other_way, size - 1, 0)
     explicit = evaluate(cage, element, *there, method="refine", level=LEVEL, faces=given)
     assert not _apart(ours, evaluate(cage, element, uv, method="refine", level=LEVEL), element)
-
     others = [{*face} for k, face in enumerate(faces) if k not in against]
     around = [edge for k in against for edge in fidelity_cages.edges_of(faces[k])]
     edges = [edge for edge in around if any({*edge} <= face for face in others)]

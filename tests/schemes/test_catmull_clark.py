@@ -20,14 +20,10 @@ MESHES = {name: make().topology for name, make in CLOSED_CAGES.items()} | OPEN
 EVERY_MESH = pytest.mark.parametrize("topology", MESHES.values(), ids=MESHES)
 
 
-def random_points(count, seed=3):
-    return np.random.default_rng(seed).standard_normal((count, 3))
-
-
 @EVERY_MESH
 def test_refinement_follows_the_rules(topology):
     """Inside open meshes, too, they are those of a closed one."""
-    t, points = topology, random_points(topology.vertex_count)
+    t, points = topology, np.random.default_rng(3).standard_normal((topology.vertex_count, 3))
     refinement = SCHEME.refine(t)
     refined = refinement.apply(points)
     begin = {"vertex": 0, "edge": t.vertex_count, "face": t.vertex_count + t.edge_count}

@@ -46,8 +46,9 @@ def named(request, monkeypatch):
 # What is differentiated together, and parameters of the shape. Of a bitmap, slopes jump along lines between the centres
 # of its texels, and rays do not know that the lines move: where points stay on the surface, it does not matter.
 IMAGE = np.random.default_rng(7).random((5, 8, 1))
-BOTH = [("cube", (*PLACED, *VALUES), {}), ("loop", ("to_world",), {})]
+VERTEX = [("cube", (*PLACED, *VALUES), {}), ("loop", ("to_world",), {})]
 EXACT = [
+    VERTEX[0],
     ("refined", VALUES, {}),
     *((scheme, (*PLACED, "cage_texcoords"), {}) for scheme in ("loop", "doo_sabin")),
     ("loop", (*PLACED, *VALUES, SCALE), HEIGHTS),
@@ -55,15 +56,15 @@ EXACT = [
     ("cube", ("displacement.data",), {**HEIGHTS, "displacement": "bitmap"}),
 ]
 # Of what others have as well, alone.
-ALONE = [("cube", (name,), HEIGHTS) for name in (SCALE, "cage_weight")]
+ALONE = [VERTEX[1], *(("cube", (name,), HEIGHTS) for name in (SCALE, "cage_weight"))]
 
 
 @llvm
 @pytest.mark.parametrize(
     ("shading", "named", "by", "parameters"),
     [
-        *(("vertex", *case) for case in BOTH),
-        *(pytest.param("exact", *case, marks=exact) for case in BOTH + EXACT),
+        *(("vertex", *case) for case in VERTEX),
+        *(pytest.param("exact", *case, marks=exact) for case in EXACT),
         *(pytest.param("exact", *case, marks=[exact, pytest.mark.long]) for case in ALONE),
     ],
     indirect=["named"],

@@ -124,10 +124,14 @@ def test_existing_frames_are_kept(folder, capsys):
     assert iio.immeta("spin.gif")["duration"] == 40
 
 
-def test_a_video_without_encoder_names_the_extra(folder, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "imageio.v2", None)
-    assert render("cube.obj", "-o", "spin.mp4", "--turntable", "3", *SMALL) == 1
-    assert 'pip install "mitsuba-subdivision[video]"' in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("package", "words", "extra"),
+    [("imageio.v2", ["a.mp4", "--turntable", "3"], "video"), ("mitsuba_oidn", ["a.png", "--denoise"], "denoise")],
+)
+def test_missing_packages_name_the_extra(folder, capsys, monkeypatch, package, words, extra):
+    monkeypatch.setitem(sys.modules, package, None)
+    assert render("cube.obj", "-o", *words, *SMALL) == 1
+    assert f'pip install "mitsuba-subdivision[{extra}]"' in capsys.readouterr().err
     assert list(folder.glob("*.png")) == []
 
 
@@ -301,10 +305,3 @@ def test_denoised_pictures_are_no_references(capsys):
     assert load_image("a.exr").metadata["denoised"]
     assert main(["compare", "a.exr", "a.exr"]) == 3
     assert '"a.exr" is denoised, which removes what is compared; expected one as rendered' in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("folder")
-def test_a_missing_denoiser_names_the_extra(capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
-    assert render("cube.obj", "-o", "a.png", "--denoise") == 1
-    assert 'pip install "mitsuba-subdivision[denoise]"' in capsys.readouterr().err

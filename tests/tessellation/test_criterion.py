@@ -213,7 +213,6 @@ def test_an_outline_in_view_is_noticed(direction, np_rng):
     eye = np.array([0.0, -4, 1])
     cone = Cone(axis, np.sin(angle))
     may_see = Sensor(eye, 1e-3, direction).may_see_outline(centre - half, centre + half, cone)
-
     places = np_rng.uniform(-1, 1, (samples, 3, count))
     places[::2] = np.sign(places[::2])
     points = centre + half * places

@@ -13,16 +13,12 @@ EVERY_SURFACE = pytest.mark.parametrize(("scheme", "name"), SURFACES)
 ROUNDING = 1e-13
 
 
-def grid_of(scheme, name, rate):
-    patches = PatchTable(cage_of(scheme, name).topology, scheme_named(scheme))
-    return UniformGrid(patches.scheme.domain, patches.elements, rate)
-
-
 @EVERY_SURFACE
 def test_sizes_have_their_formulas_and_every_vertex_is_used(scheme, name):
     """From these it follows that the Euler characteristic is that of the cage."""
+    patches = PatchTable(cage_of(scheme, name).topology, scheme_named(scheme))
     for rate in RATES:
-        grid = grid_of(scheme, name, rate)
+        grid = UniformGrid(patches.scheme.domain, patches.elements, rate)
         t, half = grid.topology, rate // 2
         inner, triangles = [], []
         for size in t.face_sizes.tolist():
