@@ -67,8 +67,9 @@ def test_parts_of_equal_division_share_pieces():
     elements = patch_trees(surface.scheme, [patch_class.signature for patch_class in surface.patches.classes])
     trees = (layout.tree_arrays(element) for element in elements)
     pieces = [of_part for tree in trees for *_, of_part in tree.maps]
-    assert sum(map(len, pieces)) > 3000
-    assert sum(len(shared) for shared in {id(shared): shared for shared in pieces}.values()) < 1000
+    count = sum(map(len, pieces))
+    assert count > 3000
+    assert sum(len(shared) for shared in {id(shared): shared for shared in pieces}.values()) < count / 3
 
 
 def test_tables_without_creases_use_the_patches_control_points():

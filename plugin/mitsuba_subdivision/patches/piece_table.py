@@ -54,7 +54,7 @@ REST, FRAME, FACTORS = LEVEL_PIECES, LEVEL_PIECES + 1, LEVEL_PIECES + 2
 COEFFICIENT_BYTES = 1 << 26
 # Maximum number of pieces of a part whose coefficients are stored as a whole. Larger elements are split into parts:
 # along semi-sharp creases there are thousands of parts of few kinds, which share coefficients.
-SHARED_PIECES = 64
+SHARED_PIECES = 128
 # Rows of `PieceTable.classes`: index of the first entry in `controls`; numbers of patches and of controls per patch;
 # first piece, and number of pieces per patch.
 CLASS = np.dtype([(name, np.int64) for name in ("first_control", "patches", "controls", "first_piece", "pieces")])
