@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from . import RegressionError
 from .image import RGB, Image
-from .tiers import DEFAULT_TIERS, TIERS, Status, TierResult, Tolerances, compare_tier, levels, pixel_of_largest
+from .tiers import COMPARE, DEFAULT_TIERS, TIERS, Status, TierResult, Tolerances, levels, pixel_of_largest
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,9 +148,10 @@ def compare(
     names = tuple(name for name in reference.names if name in test.names)
     of_missing = _missing(reference, test, missing)
     reference, test = (image.with_channels(names) for image in (reference, test))
+    strict = replace(limits, alpha=limits.alpha / suite_size)
 
     def compared(name: str) -> TierResult:
-        return compare_tier(name, reference, test, limits, suite_size)
+        return COMPARE[name](reference, test, strict)
 
     results = {name: compared(name) for name in tiers or DEFAULT_TIERS}
     _decide(results, compared, tiers)

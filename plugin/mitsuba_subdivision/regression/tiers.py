@@ -152,33 +152,28 @@ def compare_probes(reference_image: Image, test_image: Image, tolerances: Tolera
     parameters = np.abs(reference.uv.astype(float) - test.uv).max(axis=-1)
     other_triangle = float((inside & ~same_triangle).sum() / pixels)
 
-    numbers = {
-        "mask_fraction": float(other_shape.sum() / pixels),
-        "element_fraction": float(other_element.sum() / pixels),
-        "angle_p999": _percentile(angle[inside]),
-        "angle_max": float(angle[inside].max(initial=0)),
-        "position": float(distance[inside].max(initial=0)),
-        "uv_p999": _percentile(parameters[same_triangle]),
-        "triangle_fraction": other_triangle,
+    # Each measurement, what it is, its value, and that at each pixel.
+    turned, apart = np.where(inside, angle, 0), np.where(inside, distance, 0)
+    shifted = np.where(same_triangle, parameters, 0)
+    criteria = {
+        "mask_fraction": ("of the pixels hit another shape", other_shape.sum() / pixels, other_shape),
+        "element_fraction": ("of the pixels hit another element", other_element.sum() / pixels, other_element),
+        "angle_p999": ("degrees between normals, 99.9th percentile", _percentile(angle[inside]), turned),
+        "angle_max": ("degrees between normals, maximum", turned.max(), turned),
+        "position": (f"of the diagonal {diagonal:.4g} between hit points", apart.max(), apart),
+        "uv_p999": ("between surface parameters, 99.9th percentile", _percentile(parameters[same_triangle]), shifted),
     }
-    # Name, limit, text and values per pixel of each measurement.
-    criteria = [
-        ("mask_fraction", tolerances.mask_fraction, "of the pixels hit another shape", other_shape),
-        ("element_fraction", tolerances.mask_fraction, "of the pixels hit another element", other_element),
-        ("angle_p999", tolerances.angle_p999, "degrees between normals, 99.9th percentile", angle * inside),
-        ("angle_max", tolerances.angle_max, "degrees between normals, maximum", angle * inside),
-        ("position", tolerances.position, f"of the diagonal {diagonal:.4g} between hit points", distance * inside),
-        ("uv_p999", tolerances.uv_p999, "between surface parameters, 99.9th percentile", parameters * same_triangle),
-    ]
-    broken = [criterion for criterion in criteria if not numbers[criterion[0]] <= criterion[1]]
+    numbers = {name: float(value) for name, (_, value, _) in criteria.items()} | {"triangle_fraction": other_triangle}
+    limits = {"element_fraction": tolerances.mask_fraction, **tolerances.as_dict()}
+    broken = [name for name in criteria if not numbers[name] <= limits[name]]
     worst, status = None, Status.PASS
     lines = [
         f"same shapes and elements, normals within {numbers['angle_max']:.2g} degrees, "
         f"points within {numbers['position']:.2g} of the diagonal"
     ]
     if broken:
-        status, worst = Status.FAIL, pixel_of_largest(np.nan_to_num(broken[0][3], nan=np.inf))
-        lines = [f"{numbers[name]:.3g} {what}; at most {limit:.3g} expected" for name, limit, what, _ in broken]
+        status, worst = Status.FAIL, pixel_of_largest(np.nan_to_num(criteria[broken[0]][2], nan=np.inf))
+        lines = [f"{numbers[name]:.3g} {criteria[name][0]}; at most {limits[name]:.3g} expected" for name in broken]
     elif other_triangle > tolerances.mask_fraction:
         status = Status.WARN
         lines = [f"{other_triangle:.3g} of the pixels hit another triangle of the same element"]
@@ -291,7 +286,7 @@ def _in_words(value: Any) -> str:
     return "unknown" if value is None else str(value)
 
 
-def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_size: int = 1) -> TierResult:
+def compare_tiles(reference: Image, test: Image, tolerances: Tolerances) -> TierResult:
     """Test whether noise alone explains the difference of each tile: two-sided tests, at several scales.
 
     The batches of each image give its noise. A test of few samples may miss a tile's rare bright paths and show no
@@ -299,7 +294,7 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
     only rounding leaves noise. `_z_scores` has the formulas.
 
     The standard error has a floor, for the bias of single precision and of spectra of colours. Šidák's correction
-    covers the tiles and channels of a scale, Bonferroni's the scales and the scenes of a suite.
+    covers the tiles and channels of a scale, Bonferroni's the scales.
     """
     expected, tested = reference.estimate, test.estimate
     if expected is None or tested is None:
@@ -326,7 +321,7 @@ def compare_tiles(reference: Image, test: Image, tolerances: Tolerances, suite_s
         side = scale or max(height, width)
         z = _z_scores(expected, tested, least, floor, side)
         p = 2 * ndtr(-np.abs(z))
-        limit = float(-np.expm1(np.log1p(-tolerances.alpha / (len(sides) * suite_size)) / z.size))
+        limit = float(-np.expm1(np.log1p(-tolerances.alpha / len(sides)) / z.size))
         places = np.argwhere(p < limit)
         scales[str(scale or "whole")] = {
             "smallest_p": float(p.min()),
@@ -467,9 +462,4 @@ def _errors_of_others(reference: Image, test: Image) -> dict[str, NDArray[np.flo
     return errors
 
 
-def compare_tier(name: str, reference: Image, test: Image, tolerances: Tolerances, suite_size: int) -> TierResult:
-    """Compare two images by a tier of `TIERS`."""
-    if name == "tile":
-        return compare_tiles(reference, test, tolerances, suite_size)
-    compared = {"probe": compare_probes, "paired": compare_paired, "flip": compare_flip}[name]
-    return compared(reference, test, tolerances)
+COMPARE = {"probe": compare_probes, "paired": compare_paired, "tile": compare_tiles, "flip": compare_flip}
