@@ -142,11 +142,11 @@ class StageScenes(studio.SceneSource[SceneContents]):
         return contents.up, angles_for(contents, self._look), size_for(contents, self._look)
 
     def points(self, contents: SceneContents) -> NDArray[np.float64]:
-        if contents.camera is not None or "displacement" in self._parameters:
+        displaced = [shape for shape in contents.all_shapes if shape.is_displaced]
+        if not displaced or contents.camera is not None or "displacement" in self._parameters:
             return self._surfaces.points(contents)
         # The studio's camera sees displaced surfaces.
         textures = Textures(self._notes, most=_MOST_FRAMED)
-        displaced = [shape for shape in contents.all_shapes if shape.is_displaced]
         heights = {shape: largest_height(shape, textures, self._notes) for shape in displaced}
         return self._surfaces.points(contents, heights)
 
