@@ -3,12 +3,12 @@
     blender -b model.blend --python export_cage.py -- model.usda
     blender -b model.blend --python export_cage.py -- model.obj --object Chair
 
-Each function of ``MENDS`` mends faults of the exporter, which its docstring names; all were seen in Blender 4.5.1 and
-5.0.1. Where Blender mends them, the function goes. Above all, an object with a Subdivision Surface modifier becomes its
-cage: the mesh that the last such modifier gets, with the modifiers above it applied and those below it left out.
+Each function of ``MENDS`` mends faults of the exporter of Blender 4.5.1 and 5.0.1, which its docstring names, and goes
+where Blender mends them. Above all, an object with a Subdivision Surface modifier becomes its cage: the mesh that the
+last such modifier gets, with the modifiers above it applied and those below it left out.
 
-Installed as an add-on (Preferences, Add-ons, Install from Disk), this file mends what File > Export writes. As a script
-it needs Blender 4.5 or newer, or a Python that has the package bpy, and the option --blend.
+As an add-on (Preferences, Add-ons, Install from Disk), this file mends what File > Export writes. As a script it needs
+Blender 4.5 or newer, or the option --blend and a Python that has the package bpy.
 """
 
 import argparse
@@ -51,8 +51,7 @@ KINDS = Sdf.ValueTypeNames
 
 
 @functools.cache  # Once.
-def warn(message):
-    """Tell what is left out."""
+def _warn(message):
     print(f"export_cage: {message}", file=sys.stderr)
 
 
@@ -121,12 +120,11 @@ def _subdivision_of(thing):
     return next((each for each in reversed(shown) if each.subdivision_type == "CATMULL_CLARK"), None)
 
 
-def write_cage(export, path, thing):
-    """Write what the last Subdivision Surface modifier of an object gets."""
+def _write_cage(export, path, thing):
     modifier = _subdivision_of(thing)
     off = [each for each in list(thing.modifiers)[list(thing.modifiers).index(modifier) :] if each.show_render]
     if left := [each.name for each in off if each.type != "SUBSURF"]:
-        warn(f'object "{thing.name}": modifiers below "{modifier.name}" are left out: {", ".join(left)}')
+        _warn(f'object "{thing.name}": modifiers below "{modifier.name}" are left out: {", ".join(left)}')
     # One object after the other: Boolean and others apply the smooth surfaces of other objects.
     for is_shown in (False, True):
         for each in off:
@@ -156,10 +154,9 @@ def write_mesh(export, path, mesh, slots, name, modifier=None):
     if modifier:
         usd.CreateInterpolateBoundaryAttr(BOUNDARY[modifier.boundary_smooth])
         usd.CreateFaceVaryingLinearInterpolationAttr(FACE_VARYING[modifier.uv_smooth])
-        edges, sharpness, vertices, vertex_sharpness = _creases(mesh, used, modifier, export.is_animated)
-        values |= {usd.CreateCreaseIndicesAttr(): edges.ravel(), usd.CreateCreaseSharpnessesAttr(): sharpness}
-        values[usd.CreateCreaseLengthsAttr()] = np.full(len(edges), 2)
-        values |= {usd.CreateCornerIndicesAttr(): vertices, usd.CreateCornerSharpnessesAttr(): vertex_sharpness}
+        names = "creaseIndices", "creaseLengths", "creaseSharpnesses", "cornerIndices", "cornerSharpnesses"
+        parts = zip(names, _creases(mesh, used, modifier, export.is_animated), strict=True)
+        values |= {usd.GetPrim().GetAttribute(key): part for key, part in parts}
     else:
         values[usd.CreateNormalsAttr()] = _values(mesh.corner_normals, "vector", width=3)
         usd.SetNormalsInterpolation("faceVarying")
@@ -189,15 +186,15 @@ def _bind(export, usd, faces, slots):
     used, api = np.unique(faces) if slots else (), UsdShade.MaterialBindingAPI.Apply(usd.GetPrim())
     usd.CreateDisplayColorAttr([(0.8, 0.8, 0.8)])  # Of faces without a material.
     for slot in (slot for slot in used if slots[slot]):
-        name, target, these = slots[slot].name, api, np.flatnonzero(faces == slot).astype(np.int32)
+        name, target = slots[slot].name, api
         if len(used) > 1:
-            part = f"{Tf.MakeValidIdentifier(name)}_{slot}"
+            part, these = f"{Tf.MakeValidIdentifier(name)}_{slot}", np.flatnonzero(faces == slot).astype(np.int32)
             subset = api.CreateMaterialBindSubset(part, Vt.IntArray.FromNumpy(these))
             target = UsdShade.MaterialBindingAPI.Apply(subset.GetPrim())
         if name in export.materials:
             target.Bind(export.materials[name])
         elif export.materials:
-            warn(f'material "{name}" is left out, as no slot of an object has it')
+            _warn(f'material "{name}" is left out, as no slot of an object has it')
 
 
 def _creases(mesh, used, modifier, may_move):
@@ -218,7 +215,8 @@ def _creases(mesh, used, modifier, may_move):
     # Arrays of another length at the next frame are not interpolated.
     floor = -1 if may_move and any(found) else 0
     sharp, creased = np.flatnonzero(corners > floor), has_face & (sharpness > floor)
-    return np.searchsorted(used, edges[creased]), sharpness[creased], sharp, corners[sharp]
+    indices = np.searchsorted(used, edges[creased]).ravel()
+    return indices, np.full(len(indices) // 2, 2), sharpness[creased], sharp, corners[sharp]
 
 
 def meshes(export):
@@ -263,7 +261,7 @@ def meshes(export):
             export.put_matrix(place, frame.inverted() @ each.matrix_world)
     # Now that all are seen, as cages change the evaluated scene.
     for path, thing in smooth.items():
-        write_cage(export, path, thing)
+        _write_cage(export, path, thing)
     for path in [path for path, time in export.written.items() if time is not None and export.is_animated]:
         visibility = UsdGeom.Imageable.Get(export.stage, path).CreateVisibilityAttr()
         export.put(visibility, "inherited" if export.written[path] == export.time else "invisible")
@@ -272,7 +270,7 @@ def meshes(export):
 def told(export):
     """Much is left out without a word."""
     if export.depsgraph.mode != "RENDER":
-        warn("levels are those of the viewport; choose Render among the options of the export")
+        _warn("levels are those of the viewport; choose Render among the options of the export")
     for thing in (each.object for each in export.depsgraph.object_instances):
         rays = ("camera", "diffuse", "glossy", "transmission", "shadow") if thing.type == "MESH" else ()
         left = [f"rays to which it is invisible ({ray})" for ray in rays if not getattr(thing, f"visible_{ray}")]
@@ -282,7 +280,7 @@ def told(export):
         kinds = [(system.settings.type, system.settings.render_type) for system in thing.particle_systems]
         left += ["hair"] * (("HAIR", "PATH") in kinds)
         if left:
-            warn(f'object "{thing.name}": left out: {", ".join(left)}')
+            _warn(f'object "{thing.name}": left out: {", ".join(left)}')
 
 
 def cameras(export):
@@ -317,8 +315,7 @@ def cameras(export):
             values |= {"horizontalApertureOffset": data.shift_x * size, "verticalApertureOffset": data.shift_y * size}
             values["clippingRange"] = Gf.Vec2f(data.clip_start, data.clip_end)
         if render.use_motion_blur and export.is_animated:
-            starts = {"START": 0.0, "CENTER": -0.5, "END": -1.0}
-            opens = starts[render.motion_blur_position] * render.motion_blur_shutter
+            opens = {"START": 0, "CENTER": -0.5, "END": -1}[render.motion_blur_position] * render.motion_blur_shutter
             values |= {"shutter:open": opens, "shutter:close": opens + render.motion_blur_shutter}
         for each, value in values.items():
             export.put(camera.GetPrim().GetAttribute(each), value)
@@ -355,7 +352,7 @@ def lights(export):
             left += ["the square of its cone"] * light.use_square
         left += ["its neglect of shadows"] * (not light.use_shadow)
         if left:
-            warn(f'light "{thing.name}": left out: {", ".join(left)}')
+            _warn(f'light "{thing.name}": left out: {", ".join(left)}')
         for name, value in values.items():
             export.put(prim.GetAttribute(f"inputs:{name}"), value)
         export.put_matrix(prim, shape)
@@ -369,7 +366,7 @@ def world(export):
     texture = found[0] if found and found[0].type == "TEX_ENVIRONMENT" else None
     turn = _environment_turn(texture) if texture else None
     if node and (node.type != "BACKGROUND" or node.inputs["Strength"].is_linked or (found and not turn)):
-        warn(f'world "{source.name}" is more than a colour or an image and left out')
+        _warn(f'world "{source.name}" is more than a colour or an image and left out')
         export.stage.RemovePrim(path)
     elif source:
         color = Gf.Vec3f(*(1, 1, 1) if texture else node.inputs["Color"].default_value[:3] if node else source.color)
@@ -382,7 +379,7 @@ def world(export):
         else:
             dome.GetPrim().RemoveProperty("inputs:texture:file")
         if texture and (texture.image.colorspace_settings.name == "sRGB") == texture.image.is_float:
-            warn(f'world "{source.name}": its image is taken as sRGB if it has eight bits, and else as linear')
+            _warn(f'world "{source.name}": its image is taken as sRGB if it has eight bits, and else as linear')
 
 
 def _environment_turn(node):
@@ -408,11 +405,11 @@ def _origin(socket):
 
 
 def materials(export):
-    """Surfaces other than Principled BSDFs have no model, and attributes no node; coats darken; colours are mixed."""
+    """Other surfaces have no model, attributes no node; coats darken; colours are mixed; bumps are a 16th."""
     for name, material in export.materials.items():
         source, surface = bpy.data.materials.get(name), material.ComputeSurfaceSource("mtlx")[0]
         if not surface:
-            warn("materials have no networks of MaterialX; choose MaterialX Network among the options of the export")
+            _warn("materials have no networks of MaterialX; choose MaterialX Network among the options of the export")
         node = _surface_node(source) if source and surface else None
         if not node:
             continue
@@ -422,6 +419,10 @@ def materials(export):
                 _connect_attribute(name, each, material, surface)
             if each.type == "MIX" and each.data_type == "RGBA" and each.blend_type != "MIX":
                 _blend(material, each, _shader(material, each))
+        shaders = [each for each in Usd.PrimRange(material.GetPrim()) if each.IsA(UsdShade.Shader)]
+        for shader in map(UsdShade.Shader, shaders):
+            if shader.GetShaderId() == "ND_heighttonormal_vector3" and (scale := shader.GetInput("scale")).Get():
+                scale.Set(16 * scale.Get())  # MaterialX divides slopes by 16.
 
 
 def _mend_other(material_name, node, surface):
@@ -432,7 +433,7 @@ def _mend_other(material_name, node, surface):
         if name:
             _copy_input(shader.GetInput("color"), surface, name)
         elif given.HasConnectedSource():
-            warn(f'material "{material_name}": the {node.bl_label} is left out')
+            _warn(f'material "{material_name}": the {node.bl_label} is left out')
         for name, value in values.items():
             surface.CreateInput(name, KINDS.Float).Set(value)
         surface.GetPrim().RemoveProperty(given.GetFullName())
@@ -449,7 +450,7 @@ def _mend_principled(name, node, surface):
         found, given = _origin(node.inputs[label]), surface.GetInput(key)
         is_lost = found and found[0].type not in ("VERTEX_COLOR", "ATTRIBUTE", "RGB", "VALUE", "MIX")
         if is_lost and not (given and given.HasConnectedSource()):
-            warn(f'material "{name}": the {found[0].bl_label} at "{label}" is left out')
+            _warn(f'material "{name}": the {found[0].bl_label} at "{label}" is left out')
 
 
 def _connect_attribute(material_name, node, material, surface):
@@ -463,7 +464,7 @@ def _connect_attribute(material_name, node, material, surface):
             made.CreateInput("geomprop", KINDS.String).Set(Tf.MakeValidIdentifier(name))
             shader.CreateInput(key, KINDS.Color3f).ConnectToSource(made.CreateOutput("out", KINDS.Color3f))
         else:
-            warn(f'material "{material_name}": the attribute "{name}" at "{link.to_socket.name}" is left out')
+            _warn(f'material "{material_name}": the attribute "{name}" at "{link.to_socket.name}" is left out')
 
 
 def _blend(material, node, shader):
@@ -475,7 +476,7 @@ def _blend(material, node, shader):
         _copy_input(shader.GetInput("fg"), product, "in2")
         shader.GetInput("fg").ConnectToSource(product.CreateOutput("out", KINDS.Color3f))
     elif shader:
-        warn(f'material "{material.GetPrim().GetName()}": the {node.blend_type.lower()} of "{node.name}" is a mixture')
+        _warn(f'material "{material.GetPrim().GetName()}": the {node.blend_type.lower()} of "{node.name}" is a mixture')
 
 
 def _shader(material, node, output=None):
@@ -511,8 +512,7 @@ MENDS, MENDS_OF_FRAMES = (told, materials), (meshes, cameras, lights, world)
 register, unregister = bpy.utils.register_classes_factory((CageHook,))
 
 
-def obj_text(mesh):
-    """A cage in world space, with OpenSubdiv's tags."""
+def _obj_text(mesh):
     matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(mesh.GetPrim()))
     points = np.array(mesh.GetPointsAttr().Get(), float) @ matrix[:3, :3] + matrix[3, :3]
     corners, ends = np.array(mesh.GetFaceVertexIndicesAttr().Get()), np.cumsum(mesh.GetFaceVertexCountsAttr().Get())
@@ -576,8 +576,8 @@ def export_file(arguments):
             what = f"{len(chosen)} {'cages' if is_obj else 'meshes'} of {options.object or 'all objects'}; choose one"
             sys.exit(f"export_cage: a render shows {what} with --object: {names}")
         if is_obj:
-            warn(f"OBJ files hold one cage; other meshes that are left out: {len(found) - 1}")
-            part.write_text(obj_text(chosen[0]), encoding="utf-8", newline="\n")
+            _warn(f"OBJ files hold one cage; other meshes that are left out: {len(found) - 1}")
+            part.write_text(_obj_text(chosen[0]), encoding="utf-8", newline="\n")
         elif options.object:
             prims = [mesh.GetPrim() for name, mesh in found if name != options.object]
             for prim in [prim.GetParent() if prim.IsInstanceProxy() else prim for prim in prims]:

@@ -405,10 +405,7 @@ def tiles(folder):
     tile.set(Base_Color=tile.node("VertexColor", layer_name="Tint")["Color"])
     tile = Tile()
     tile.show(tile.node("Emission", {"Color": (0.2, 0.6, 0.1, 1.0)})[0])
-
-
-def what_is_left_out():
-    """A tile behind the camera with all that has no place in the file."""
+    # Behind the camera, what has no place in the file.
     tile = Tile()
     tile.thing.location, tile.thing.visible_shadow = (0, -30, 0), False
     tile.show(tile.node("BsdfGlass")[0])
@@ -432,7 +429,6 @@ def sky(folder):
 def make_look(model):
     """Tiles of materials that read images, depth of field and a shift."""
     tiles(os.path.dirname(model))
-    what_is_left_out()
     sky(os.path.dirname(model))
     aim("Sun", "SUN", rotation=(1.0, 0.3, 0), energy=1.5, angle=0.005)
     cone = {"spot_size": 0.7, "spot_blend": 0.6, "shadow_soft_size": 0.0}
@@ -461,10 +457,9 @@ def make_studio(model):
     block(Metallic=1.0, Roughness=0.3, Specular_IOR_Level=0.5, Base_Color=(0.9, 0.6, 0.2, 1.0))
     tile = block()
     tile.set(Normal=tile.node("Bump", {"Distance": 0.1, "Height": tile.picture(waves)["Color"]})["Normal"])
-    tile, color = block(), (0.1, 0.2, 0.7, 1.0)
+    tile = block()
     mixed = {0: tile.node("Value")[0], 6: red, 7: tile.node("RGB")[0]}
-    for socket, value in ((mixed[0], 0.3), (mixed[7], color)):
-        socket.default_value = value
+    mixed[0].default_value, mixed[7].default_value = 0.3, (0.1, 0.2, 0.7, 1.0)
     tile.set(Base_Color=tile.node("Mix", mixed, data_type="RGBA")[2])
     tile = block()
     tile.show(tile.node("BsdfDiffuse")[0])

@@ -139,9 +139,6 @@ def test_materials_are_bound_to_faces(scene):
     parts = stage.GetPrimAtPath("/root/no_creases/Mesh").GetChildren()
     assert [bound_color(part) for part in parts] == 2 * [pytest.approx((0.9, 0.6, 0.2))]
     assert bound_color(stage.GetPrimAtPath("/root/Ground/Mesh")) == pytest.approx((0.9, 0.6, 0.2))
-    # Faces without a material are grey.
-    grey = UsdGeom.Gprim(stage.GetPrimAtPath("/root/Smooth/Mesh")).GetDisplayColorAttr().Get()
-    np.testing.assert_allclose(grey, [[0.8, 0.8, 0.8]], rtol=1e-6)
 
 
 def test_polygons_with_smooth_shading_have_normals(scene):
@@ -158,7 +155,7 @@ def bound_color(prim):
     return tuple(material.ComputeSurfaceSource("mtlx")[0].GetInput("base_color").Get())
 
 
-# Of points up to a hundred units away, in single precision.
+# Of points up to thirty units away, in single precision.
 POINT_TOLERANCE = 3e-5
 
 
@@ -212,22 +209,17 @@ def test_animated_properties_have_samples(shown):
 # Relative and absolute difference of means of the pixels of an object.
 MEAN, DARK = 0.05, 0.004
 # Mitsuba's BSDFs are other models of reflection: see the table of the guide.
-OTHERS, MEAN_OF_OTHERS = ("block_0", "block_2", "block_3", "block_4", "tile_4"), 0.15
-PICTURES = {
-    "look": ["--spp", "128"],
-    "shown": ["--spp", "16", "--time", "2", "--shutter", "16"],
-    "studio": ["--spp", "128"],
-    "houses": ["--spp", "128"],
-}
+OTHERS, MEAN_OF_OTHERS = ("block_0", "block_2", "block_3", "tile_4"), 0.15
+OPTIONS = {"shown": ["--spp", "16", "--time", "2", "--shutter", "16"]}
 
 
-@pytest.mark.parametrize("kind", PICTURES)
+@pytest.mark.parametrize("kind", ["look", "shown", "studio", "houses"])
 @pytest.mark.filterwarnings("ignore::mitsuba_subdivision.CageWarning")  # Of what is left out.
 def test_objects_are_as_bright_as_in_cycles(made, kind):
     """Materials, lights, the world and the camera, also where they move."""
     usda, (names, _), _ = made(kind)
-    picture = usda.with_name("mitsuba.exr")
-    assert main(["render", str(usda), "-o", str(picture), "--filter", "box", *PICTURES[kind]]) == 0
+    picture, options = usda.with_name("mitsuba.exr"), OPTIONS.get(kind, ["--spp", "128"])
+    assert main(["render", str(usda), "-o", str(picture), "--filter", "box", *options]) == 0
     expected, result = np.array(mi.Bitmap(str(usda.with_suffix(".exr")))), np.array(mi.Bitmap(str(picture)))
     assert result.shape[:2] == expected.shape[:2]
     wrong, numbers = {}, expected[..., -1].astype(int)
