@@ -107,10 +107,6 @@ class PatchTree:
         return int(self.kind == PartKind.REGULAR) + sum(child.regular_count for child, _ in self.children)
 
     @cached_property
-    def tip_count(self) -> int:
-        return int(self.kind == PartKind.TIP) + sum(child.tip_count for child, _ in self.children)
-
-    @cached_property
     def tips(self) -> tuple[Piece, ...]:
         """All tips, as pieces of this element."""
         if self.piece is not None:
@@ -148,7 +144,7 @@ class PatchTree:
         if not children:
             return np.empty((0, 3), dtype=np.int64)
         # For each child and `PartKind` the first index: of a node for inner nodes, of a piece for regular pieces, tips.
-        sizes = np.array([[len(child._below)] * 2 + [child.regular_count, child.tip_count] for child in children])
+        sizes = np.array([[len(child._below)] * 2 + [child.regular_count, len(child.tips)] for child in children])
         first = np.cumsum(sizes, axis=0) - sizes + [len(children), len(children), 0, 0]
         rows = [(child.kind, child.turn, row[child.kind]) for child, row in zip(children, first.tolist(), strict=True)]
         below = np.concatenate([child._below for child in children])

@@ -65,11 +65,20 @@ class VertexKernel:
         return vertices
 
     @replayed
-    def _evaluated(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        padded, buffers = self._padded(control_points), self._buffers()
+    def _evaluated(
+        self, control_points: FloatBuffer, change: FloatBuffer | None = None
+    ) -> tuple[FloatBuffer, FloatBuffer]:
+        """Points and normals, or their directional derivatives for a change of the control points; flat, detached."""
+        padded, padded_change = self._padded(control_points), None if change is None else self._padded(change)
+        kind, size = self._types.float, 3 * self.vertex_count
+        buffers: tuple[FloatBuffer, FloatBuffer] = dr.empty(kind, size), dr.empty(kind, size)
         for part in self._parts:
-            part.evaluate(padded, buffers)
-        return self._welded(*buffers)
+            part.evaluate(padded, buffers, padded_change)
+        positions, normals = buffers
+        # Bitwise equal on both sides of a crease: see `VertexTable.weld_target`
+        if self._weld_target is not None:
+            positions = self._types.gathered(positions, self._weld_target)
+        return positions, normals
 
     def attached(
         self, control_points: FloatBuffer, positions: FloatBuffer, normals: FloatBuffer
@@ -78,17 +87,9 @@ class VertexKernel:
 
         Needed once for each gradient: Dr.Jit removes a computation from its graph once gradients have passed through.
         """
-        derivatives = (partial(function, dr.detach(control_points)) for function in (self.changes, self.gradient))
+        derivatives = (partial(function, dr.detach(control_points)) for function in (self._evaluated, self.gradient))
         vertices: tuple[FloatBuffer, FloatBuffer] = attached((positions, normals), control_points, *derivatives)
         return vertices
-
-    @replayed
-    def changes(self, control_points: FloatBuffer, change: FloatBuffer) -> tuple[FloatBuffer, ...]:
-        """Directional derivatives of points and normals for a change of the control points; flat, detached."""
-        padded, padded_change, buffers = self._padded(control_points), self._padded(change), self._buffers()
-        for part in self._parts:
-            part.evaluate(padded, buffers, padded_change)
-        return self._welded(*buffers)
 
     @replayed
     def gradient(self, control_points: FloatBuffer, positions: FloatBuffer, normals: FloatBuffer) -> FloatBuffer:
@@ -108,16 +109,6 @@ class VertexKernel:
     def _padded(self, control_points: FloatBuffer) -> FloatBuffer:
         points = control_points if self._refinement is None else self._refinement.product(control_points)
         return self._types.padded(points)
-
-    def _welded(self, positions: FloatBuffer, normals: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
-        """Make positions bitwise equal on both sides of a crease, see `VertexTable.weld_target`."""
-        if self._weld_target is not None:
-            positions = self._types.gathered(positions, self._weld_target)
-        return positions, normals
-
-    def _buffers(self) -> tuple[FloatBuffer, FloatBuffer]:
-        kind, size = self._types.float, 3 * self.vertex_count
-        return dr.empty(kind, size), dr.empty(kind, size)
 
 
 class _Part:

@@ -110,17 +110,14 @@ class RingTable:
         self._corner_counts = np.array([len(ring.around) for ring in rings])
         self._corner = np.concatenate([ring.corner for ring in rings])
         self._offset = np.concatenate([ring.offset for ring in rings])
-
-    @cached_property
-    def _surroundings(self) -> tuple[IndexArray, IndexArray]:
-        return surroundings(self.topology)
+        self._surroundings: tuple[IndexArray, IndexArray] | None = None  # Kept from the first call of `vertices_of` on
 
     @cached_property
     def vertices(self) -> IndexArray:
         """The vertices of all groups, flat: for each local vertex of a group, those of all its elements."""
         # Often the largest array of all. The surroundings are half as large, and are not kept for it.
         t, vertices = self.topology, np.empty(self.offsets[-1], dtype=np.int32)
-        start, around = vars(self).get("_surroundings") or surroundings(t)
+        start, around = self._surroundings or surroundings(t)
         bounds = pairwise(self._first_element.tolist()), pairwise(self.offsets.tolist())
         for ring, elements, entries in zip(self.rings, *bounds, strict=True):
             columns = vertices[slice(*entries)].reshape(ring.vertex_count, -1)
@@ -139,7 +136,8 @@ class RingTable:
         element: IntArray,  # (s,) int64: index in the group
     ) -> list[IndexArray]:
         """Return the vertices ``(n, K)`` of some elements, for each group that has any of them."""
-        t, (start, around) = self.topology, self._surroundings
+        t = self.topology
+        start, around = self._surroundings = self._surroundings or surroundings(t)
         counts, corner_counts = self.vertex_counts[group], self._corner_counts[group]
         corners = t.along_faces(self.half_edges[self._first_element[group] + element], corner_counts)
         place = ragged.ranges(ragged.starts(self.vertex_counts)[group], counts)

@@ -135,7 +135,7 @@ class PieceTable:
     ) -> PieceTable:
         table = patches.evaluated
         counts, elements = table.patch_counts, table.trees
-        tip_count = int(np.array([element.tip_count for element in elements]) @ counts)
+        tip_count = int(np.array([len(element.tips) for element in elements]) @ counts)
         packet_count = piece_packets(len(polynomial_basis(table.scheme).powers)) * LEVEL_PIECES * tip_count
         bytes_of_level = 4 * PACKET * packet_count
         if bytes_of_level:

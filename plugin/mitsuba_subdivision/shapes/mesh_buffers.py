@@ -119,7 +119,8 @@ class MeshBuffers:
             surface.set_control_points(points)
         elif surface is not None and self.are_differentiable and dr.grad_enabled(points):
             surface.values.attach(points)
-        sources = self._sources(control_points)
+        heights = [] if self._displacement is None else self._displacement.variables()
+        sources = [control_points, self._placement.matrix, *heights]
         moves = self.are_differentiable and dr.grad_enabled(*sources)
         if moves:
             self.passes.begin(sources)
@@ -129,7 +130,7 @@ class MeshBuffers:
         vertices: tuple[FloatBuffer, FloatBuffer] = evaluate() if loaded is None else loaded.get(evaluate)
         # Also kept for a displacement, as gradients of heights may be enabled later.
         self._evaluated = vertices if moves or self._displacement is not None else None
-        return self._placed(*self._attached(vertices, points), points)
+        return self._placed(points, *vertices)
 
     def attached(self, control_points: FloatBuffer) -> dict[str, FloatBuffer]:
         """Attach exact shading and the buffers of the last evaluation to the parameters again."""
@@ -138,7 +139,7 @@ class MeshBuffers:
             surface.values.attach(points)
         if self._evaluated is None:
             raise RuntimeError("vertices were not kept; expected an evaluation with derivatives before")
-        return self._placed(*self._attached(self._evaluated, points), points)
+        return self._placed(points, *self._evaluated)
 
     def settle(self) -> None:
         """Drop what only updates need, after loading. All kernels of this thread must have ended."""
@@ -154,18 +155,8 @@ class MeshBuffers:
 
         return shared(VertexKernel, self.table, self._types.float)
 
-    def _attached(
-        self, vertices: tuple[FloatBuffer, FloatBuffer], points: FloatBuffer
-    ) -> tuple[FloatBuffer, FloatBuffer]:
-        is_moving = self.are_differentiable and dr.grad_enabled(points)
-        return self._kernel.attached(points, *vertices) if is_moving and self._kernel is not None else vertices
-
     def _vertices(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         return self._on_host(points) if self._kernel is None else self._kernel.evaluated(points)
-
-    def _sources(self, control_points: FloatBuffer) -> list:
-        heights = [] if self._displacement is None else self._displacement.variables()
-        return [control_points, self._placement.matrix, *heights]
 
     def _on_host(self, points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
         coordinates = np.array(points, dtype=np.float64).reshape(-1, 3)
@@ -189,8 +180,10 @@ class MeshBuffers:
             return flat.reshape(-1, 3)[self._copied].ravel()
         return self._types.gathered(flat, self._copied)
 
-    def _placed(self, positions: FloatBuffer, normals: FloatBuffer, points: FloatBuffer) -> dict[str, FloatBuffer]:
+    def _placed(self, points: FloatBuffer, positions: FloatBuffer, normals: FloatBuffer) -> dict[str, FloatBuffer]:
         placement, shading = self._placement, self._shading
+        if self.are_differentiable and dr.grad_enabled(points) and self._kernel is not None:
+            positions, normals = self._kernel.attached(points, positions, normals)
         positions, normals = self._split(positions), self._split(normals)
         if self._displaced is not None:
             positions, normals = self._displaced(positions, normals, points)

@@ -55,6 +55,7 @@ class UniformGrid:
     ) -> None:
         self.domain, self.topology, self.rate = domain, topology, rate
         self._is_whole = topology.face_sizes == domain.corner_count
+        self._corner_count = int(np.count_nonzero(topology.vertex_half_edge >= 0))
         # Whole cells from a corner of a polygon to the midpoints of its edges.
         self._half, self._is_odd = rate // 2, rate % 2 == 1
         # Steps from a corner of a polygon to samples inside its grid: for an even rate, the last one is on a spoke.
@@ -76,10 +77,6 @@ class UniformGrid:
     def corner_vertex(self) -> NDArray[np.uint32]:
         """``(n_v,)`` number of each vertex of the topology; undefined where no face uses it."""
         return np.cumsum(self.topology.vertex_half_edge >= 0, dtype=np.uint32) - 1
-
-    @cached_property
-    def _corner_count(self) -> int:
-        return int(np.count_nonzero(self.topology.vertex_half_edge >= 0))
 
     def edge_start(self, corners: IntArray) -> IntArray:
         """Number of the first vertex inside the edge that begins at each corner, along the edge's lowest half-edge."""
