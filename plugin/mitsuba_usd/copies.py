@@ -18,7 +18,7 @@ from .contents import SceneContents, ShapeContents
 from .stage_warnings import StageWarnings
 
 LEAST_INSTANCES = 64  # Fewer instances cost less than a second in each picture
-# Faces of meshes whose copies load sooner as shapes of their own than as one mesh, in a third of the memory.
+# Faces of meshes whose copies load sooner as separate shapes than as one mesh, in a third of the memory.
 LARGE = 10_000
 # Measured memory of copies as one mesh; and its largest part of the machine's memory, and largest size.
 FACE_BYTES, TRIANGLE_BYTES, POINT_BYTES = {"exact": 600, "vertex": 300}, 170, 400

@@ -54,7 +54,7 @@ def triangles_for_picture(
     *,
     follows_sensor: bool = True,  # Whether no other sensor renders the scene
 ) -> dict[ShapeContents, dict[str, Any]]:
-    """Parameters of usable limit surfaces with the fewest triangles whose facets do not show in an image.
+    """Parameters of usable limit surfaces with the fewest triangles and no visible facets in an image.
 
     With exact shading, surfaces outside groups may be adaptive, unless they are displaced: their outline is unknown.
     """

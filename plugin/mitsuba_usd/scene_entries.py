@@ -133,7 +133,7 @@ def scene_entries(
 
 
 class Surfaces:
-    """Caches limit surfaces: the left and the right bishop, black or white, share one."""
+    """Cache of limit surfaces: all four bishops share one."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[int, ...], list[tuple[CageContents, LimitSurface]]] = {}

@@ -123,7 +123,7 @@ def angles_for(contents: SceneContents, look: Look) -> View:
 def with_studio_defaults(
     contents: SceneContents, points: NDArray[np.float64], is_lit: bool, look: Look, notes: StageWarnings, name: str
 ) -> SceneNode:
-    """Entries of the integrator and the sensor, and of the studio's parts that the stage lacks, around points."""
+    """Entries of integrator and sensor, and of missing lights or camera from the studio, around points."""
     camera, size = contents.camera, size_for(contents, look)
     bounds = np.stack([points.min(axis=0), points.max(axis=0)])
     if (bounds[0] == bounds[1]).all():

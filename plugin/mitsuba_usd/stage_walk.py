@@ -222,13 +222,13 @@ class _StageWalk:
         elif prim.HasAPI(UsdLux.LightAPI):
             files.require_types(prim, self._code)
             light = read_light(prim, matrix(), self._code, self._notes)
-            # A light without power would only keep the studio's lights away.
+            # A light without power would prevent the studio's lights.
             below.lights.extend([replace(light, name=name)] if light and any(light.emission) else [])
         elif str(prim.GetTypeName()) not in _SILENT:
             self._notes.add(f"prims of type {prim.GetTypeName()} are ignored", prim.GetPath())
 
     def _appearance(self, prim: Usd.Prim) -> tuple[object, ...]:
-        """Key that instances of one prototype share if they look the same: the prototype, and what it inherits."""
+        """Key of instances of equal appearance: the prototype, and inherited values."""
         binding = UsdSkel.BindingAPI(prim)
         skeleton, animation = binding.GetInheritedSkeleton(), binding.GetInheritedAnimationSource()
         # A skeleton outside the instance poses each instance by itself.

@@ -1,4 +1,4 @@
-"""Models of surfaces in common terms, which become BSDFs of Mitsuba.
+"""Material models in common terms, which become BSDFs of Mitsuba.
 
 Each model is a function from its inputs to those of `NEUTRAL`, as expressions: Standard Surface of Autodesk (1.0.1),
 OpenPBR (1.1), UsdPreviewSurface (2.6) and glTF PBR (2.0), as in the library of MaterialX 1.39.
