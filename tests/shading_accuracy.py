@@ -25,9 +25,7 @@ CAMERAS = {
     "star": ([3, -4, 2], [0, 0, 0]),
     "barrel": ([4, -6, 4], [0, 0, 0.5]),
 }
-REFERENCE_RATE = 64
-SAME_PLACE = 3e-2
-BRIGHTEST = 9
+REFERENCE_RATE, SAME_PLACE, BRIGHTEST = 64, 3e-2, 9
 
 
 def main() -> None:

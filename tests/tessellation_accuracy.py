@@ -37,8 +37,7 @@ WITH_OUTLINES = ("human", "rook", "barrel")
 REFERENCE_RATE = 64
 # Points of each triangle that are looked at: of a lattice of so many steps, but for its corners.
 STEPS = 4
-TRIANGLES_AT_ONCE = 40_000
-WIDTH, FOV = 512, 40.0
+TRIANGLES_AT_ONCE, WIDTH, FOV = 40_000, 512, 40.0
 # Points along outlines, and how far beside them there is nothing, in pixels.
 SPACING, BESIDE = 1 / 40, 1 / 100
 VIEW = np.array([0.6, -1.1, 0.35])

@@ -303,8 +303,7 @@ def make_shown(model):
     return names, found
 
 
-TEXELS = 32
-COLUMNS, DISTANCE = 4, 2.2
+TEXELS, COLUMNS, DISTANCE = 32, 4, 2.2
 DULL, SHINY = ({"Roughness": roughness, "Specular_IOR_Level": level} for roughness, level in ((1.0, 0.0), (0.5, 0.5)))
 SIZE = (96, 72)
 SAMPLES = 128

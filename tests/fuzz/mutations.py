@@ -23,8 +23,7 @@ _PACKED = (
       for order in "<>" for kind in "fd" for value in (float("nan"), float("inf"), 1e30)),
     b"\x01\x00\xa0\x7f", b"\x7f\xa0\x00\x01", b"\x00\x00\x00\x00\x00\x00\xf4\x7f",  # NaNs that signal.
 )  # fmt: skip
-_LONG = 3000
-_REACH = 100
+_LONG, _REACH = 3000, 100
 
 
 def mutated(content: bytes, words: tuple[bytes, ...], random: Random) -> bytes:

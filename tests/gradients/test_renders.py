@@ -20,7 +20,7 @@ CASES = [
     ("rough", "vertex", False),
     ("textured", "vertex", True),
     pytest.param("textured", "exact", True, marks=exact),
-    pytest.param("rough", "exact", False, marks=exact),
+    pytest.param("rough", "exact", False, marks=[exact, pytest.mark.long]),
 ]
 
 

@@ -47,8 +47,7 @@ BORDER_NORMAL = 2e-6
 ONE_POINT = 2.0**-24
 # Central differences in double precision: truncation of about the step squared, rounding over the step.
 STEP = 1e-6
-DIFFERENCES = 1e-7
-HIT_DIFFERENCES = 1e-6
+DIFFERENCES, HIT_DIFFERENCES = 1e-7, 1e-6
 # Near extraordinary points, curvature grows beyond bounds, and so do derivatives and what differences leave out.
 STEEP = 1e-4
 # Of the largest: third derivatives are differences over 2^-10 of a piece, of polynomials of some curvature.

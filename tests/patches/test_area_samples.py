@@ -11,8 +11,7 @@ from mitsuba_subdivision.patches.area_samples import uniform_locations
 from scipy.special import chdtrc
 
 NAMES = ["mixed torus", "half disc of 6", "crease", "loop mixed torus", "loop corner", "doo_sabin mixed torus"]
-SIGNIFICANCE = 1e-3
-COUNT = 10_000
+SIGNIFICANCE, COUNT = 1e-3, 10_000
 # Cells on each side of an element, and parts of a cell that are evaluated to measure it.
 CELLS, PARTS = 4, 2
 

@@ -61,9 +61,7 @@ APPROACH = 0.4
 LEVEL = 6
 # Nothing of `ISLANDS` is semi-sharp for longer than three refinements.
 LEVEL_OF_VALUES = 4
-STEPS = 8
-SAMPLES = 400
-CLOSEST = 6
+STEPS, SAMPLES, CLOSEST = 8, 400, 6
 SMOOTH, DART, CREASE, CORNER = 1, 2, 4, 8
 EVERY_SURFACE = pytest.mark.parametrize("cage", SURFACES.values(), ids=SURFACES)
 EVERY_ISLAND = pytest.mark.parametrize("cage", ISLANDS.values(), ids=ISLANDS)

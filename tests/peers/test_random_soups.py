@@ -11,9 +11,7 @@ from .test_fidelity import AGAINST_OSD, POINT, at, box, distance, rounding
 
 pytestmark = AGAINST_OSD
 
-COUNT = 30
-SAMPLES = 60
-CLOSEST = 4
+COUNT, SAMPLES, CLOSEST = 30, 60, 4
 
 
 def soup(rng):

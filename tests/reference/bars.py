@@ -15,5 +15,4 @@ POINT_FLOAT32 = 1e-6
 # In degrees, to valence 20. Tangents shrink as faces beside the point get narrow, so that less can be asked to valence
 # 50, and nothing beyond. Processors add in different orders: up to 9e-5 to valence 20, and 1.3e-4 to 50.
 NORMAL_FLOAT32 = 1e-4
-NORMAL_FLOAT32_VALENCES = 20
-NORMAL_FLOAT32_NARROW = 3e-4
+NORMAL_FLOAT32_VALENCES, NORMAL_FLOAT32_NARROW = 20, 3e-4

@@ -19,8 +19,7 @@ if hook_problem():
 
 pytestmark = llvm
 
-FINE = 12
-RESOLUTION = 32
+FINE, RESOLUTION = 12, 32
 # Of pictures of which only the hits are needed.
 EDGE = 64
 # Places and normals in float32, relative to a cage of size one.

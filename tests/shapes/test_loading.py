@@ -21,7 +21,7 @@ from shapes.variants import every_array_variant, every_variant, exact, llvm, sca
 pytestmark = pytest.mark.threads
 
 # Four frames of Python for each of so many shapes on two threads are more than a stack may have, were they nested.
-MANY = 600
+MANY = pytest.param(600, True, [{}], marks=pytest.mark.long)
 # Of what takes longer; enough that constructors go on in other threads several times.
 SOME = 3 * registration.DEEPEST
 BUFFERS = ("vertex_positions", "vertex_normals", "vertex_colour", "faces", "face_element")
@@ -63,7 +63,7 @@ WAITING = [
 @llvm
 @pytest.mark.parametrize(
     ("count", "parallel", "kinds"),
-    [(MANY, True, [{}]), (SOME, False, [{}]), pytest.param(SOME, True, WAITING, marks=exact)],
+    [MANY, (SOME, False, [{}]), pytest.param(SOME, True, WAITING, marks=exact)],
     ids=["parallel", "one by one", "what waits within constructors"],
 )
 def test_many_shapes_load(count, parallel, kinds):

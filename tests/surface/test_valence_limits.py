@@ -45,7 +45,10 @@ def test_a_valence_above_the_limit_is_refused_at_once(scheme, cage, message):
         LimitSurface(cage, scheme).tessellate(1)
 
 
-@pytest.mark.parametrize("tags", [{}, {"creases": [[64, 0, 10]]}, {"creases": [[64, 0, 2.5]]}])
+SMOOTH = pytest.param({}, marks=pytest.mark.long)
+
+
+@pytest.mark.parametrize("tags", [SMOOTH, {"creases": [[64, 0, 10]]}, {"creases": [[64, 0, 2.5]]}])
 @pytest.mark.parametrize("scheme", ["catmull_clark", "loop"])
 def test_valences_at_the_limit_are_evaluated(scheme, tags):
     count = 64 if tags else 511

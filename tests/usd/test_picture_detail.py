@@ -170,8 +170,7 @@ def test_equal_cages_are_made_once_and_warn_by_their_own_names():
 
 
 CUBE = named_cages.cube().contents
-POINTS = CUBE.positions
-COUNT = LEAST_INSTANCES + 6
+POINTS, COUNT = CUBE.positions, LEAST_INSTANCES + 6
 
 
 def cube_shape(name="/cube", to_world=None, **changes):
