@@ -2,13 +2,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import LimitSurface, upload
+from mitsuba_subdivision import CageWarning, LimitSurface, upload
 from patches.closed_cages import cube_with_hexagon, extraordinary_triangles
 from reference.refined_cages import refine_first
 from shapes.cages import RING, bitmap, cube, described, load, with_attributes
-from shapes.scenes import rays, scene_with
+from shapes.scenes import down, rays, scene_with
 from shapes.updates import MODES, derivative, moving
-from shapes.variants import every_ad_variant, exact, llvm
+from shapes.variants import every_ad_variant, exact, exact_llvm, llvm
 
 pytestmark = pytest.mark.usefixtures("no_other_scene")
 # Over a step of control points: rounding over the step, and what values bend within it, beside the largest derivative.
@@ -161,3 +161,12 @@ def test_derivatives_of_vertices_are_central_differences(named, by, displacement
     assert abs(difference) > 100 * VERTEX_DIFFERENCE
     assert backward == pytest.approx(difference, abs=VERTEX_DIFFERENCE)
     assert forward == pytest.approx(backward, abs=1e-2 * VERTEX_DIFFERENCE)
+
+
+@exact_llvm
+def test_derivatives_enabled_after_the_last_update_warn_once():
+    scene = scene_with(shape=described(cube(), shading="exact"))
+    dr.enable_grad(mi.traverse(scene)["shape.control_points"])
+    with pytest.warns(CageWarning, match=r"expected params\.update\(\)"):
+        scene.ray_intersect(down())
+    scene.ray_intersect(down())

@@ -216,11 +216,5 @@ def _repeated(step: Callable[[Any], Any], start: Any, is_active: Callable[[Any],
         d, *surface = (vector(*numbers[i : i + 3]) for i in range(count, len(numbers), 3))
         return make(*numbers[:count], d, surface)
 
-    end = dr.while_loop(
-        numbers(start),
-        lambda *values: is_active(state(values)),
-        lambda *values: numbers(step(state(values))),
-        mode="symbolic",
-        label=label,
-    )
-    return state(end)
+    functions = (lambda *values: is_active(state(values))), (lambda *values: numbers(step(state(values))))
+    return state(dr.while_loop(numbers(start), *functions, mode="symbolic", label=label))

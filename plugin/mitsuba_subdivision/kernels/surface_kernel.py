@@ -323,8 +323,8 @@ class SurfaceKernel:
         ends = () if lines is None else lines.variables
 
         def traced(coefficients: FloatBuffer, *ends: Vector3) -> tuple[Vector3 | Float, ...]:
-            constraint = None if lines is None else replace(lines, o=ends[0], d=ends[1])
-            return _parts(self._traced(coefficients, points.location, active, 1, constraint))
+            moved = lines and replace(lines, o=ends[0], d=ends[1])
+            return _parts(self._traced(coefficients, points.location, active, 1, moved))
 
         def propagated(mode: dr.ADMode, start: Any, changes: Any) -> None:
             dr.accum_grad(start, changes)
@@ -351,12 +351,7 @@ class SurfaceKernel:
         return attached(_parts(points), argument, forward, backward)
 
     def _traced(
-        self,
-        coefficients: FloatBuffer,
-        location: Location,
-        active: Mask,
-        derivatives: int,
-        constraint: Lines | NearestPoints | None,
+        self, coefficients: FloatBuffer, location: Location, active: Mask, derivatives: int, constraint: Any
     ) -> SurfacePoints:
         fixed = dr.detach(location)
         piece = self._piece(coefficients, fixed.half_edge, fixed.u, fixed.v, active)
@@ -374,13 +369,7 @@ class SurfaceKernel:
         return points
 
     def _piece(
-        self,
-        coefficients: FloatBuffer,
-        half_edge: Index,
-        u: Float,
-        v: Float,
-        active: Mask = True,
-        row: Index4 | None = None,
+        self, coefficients: FloatBuffer, half_edge: Index, u: Float, v: Float, active: Mask = True, row: Index4 = None
     ) -> Piece:
         piece = self._patches.piece(coefficients, half_edge, u, v, active, row)
         return piece if self.displacement is None else self.displacement.piece(piece, half_edge, u, v, active)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..device_arrays import mapped
 from ..kernels.array_types import ArrayTypes, FloatBuffer, Matrix4
+from .device_state import is_recording
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -86,6 +87,8 @@ class Placement:
     ) -> None:
         """Set ``to_world``."""
         matrix: Matrix4 = to_world.matrix
+        # Made by `inverse`, but not while a function is recorded
+        self._inverse: Matrix4 = None
         is_jit, is_moving = dr.is_jit_v(matrix), dr.grad_enabled(matrix)
         self.matrix = matrix if is_jit else value
         if self.centre is not None:
@@ -112,10 +115,13 @@ class Placement:
 
     def inverse(self) -> Matrix4:
         """Inverse of the parameter, without the centre, as a detached Dr.Jit matrix."""
+        if self._inverse is not None:
+            return self._inverse
         is_read = isinstance(self.parameter, np.ndarray)
         inverse = type(self.matrix)(np.linalg.inv(self.parameter).tolist()) if is_read else dr.rcp(self.parameter)
         # Dr.Jit compiles literals into kernels.
         dr.make_opaque(inverse)
+        self._inverse = None if is_recording() else inverse
         return inverse
 
     def placed(self, positions: FloatBuffer, normals: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:
