@@ -197,10 +197,10 @@ class _Surface:
         if self._is("coat", 0) or (eta := _index(self._reflectance("coat_ior"))) == 1:
             return entry
         mean = float(conductor_reflectance(eta, 0, _COSINES).mean())
-        # A conductor without absorption is a dielectric that only reflects.
-        # Never a mirror, which would not show the highlights of lights without size.
-        lobe = _conductor(eta, 0.0, self._widths("coat_roughness", None) or {"alpha": _MIRROR})
-        coat = self._with_normal_map({**lobe, "specular_reflectance": 1 / mean}, "coat_normal", is_diffuse=False)
+        # A conductor without absorption reflects as a dielectric. A mirror would not reflect lights without size.
+        widths = self._widths("coat_roughness", None) or {"alpha": _MIRROR}
+        lobe = {**_specular("conductor", widths), "eta": eta, "k": 0.0, "specular_reflectance": 1 / mean}
+        coat = self._with_normal_map(lobe, "coat_normal", is_diffuse=False)
         weight = self.number(number("multiply", self._inputs["coat"], mean))
         return {"type": "blendbsdf", "weight": weight, "bsdf_0": entry, "bsdf_1": _both_sides(coat)}
 
@@ -251,21 +251,18 @@ class _Surface:
 
     def _metal(self) -> SceneNode:
         n, k = conductor(constant(self._inputs["base_color"], 3), self._mean("edge_color"))
-        return _conductor(rgb(n), rgb(k), self._widths("roughness", self._ratio()))
+        return {**_specular("conductor", self._widths("roughness", self._ratio())), "eta": rgb(n), "k": rgb(k)}
 
     def _glass(self) -> SceneNode:
         if not self._is("thin", 0):
             return self._sheet(1.0)
         eta = _first(self._mean("ior"))
-        entry: SceneNode = {
+        return {
+            **_specular("dielectric", None if self._is("clear", 1) else self._widths("roughness", self._ratio())),
             "int_ior": float(np.clip(eta, 1 / _MOST_ETA, _MOST_ETA)) if abs(eta - 1) > _MIRROR else 1 + _MIRROR,
             "ext_ior": 1.0,
             "specular_transmittance": self._color(self._inputs["transmission_color"]),
         }
-        widths = None if self._is("clear", 1) else self._widths("roughness", self._ratio())
-        if widths is None:
-            return {"type": "dielectric", **entry}
-        return {"type": "roughdielectric", "distribution": "ggx", **entry, **widths}
 
     def _sheet(self, transmission: float) -> SceneNode:
         inputs = self._inputs
@@ -325,10 +322,8 @@ class _Surface:
         return {"alpha_u": self.number(u), "alpha_v": self.number(v)}
 
 
-def _conductor(eta: Any, k: Any, widths: SceneNode | None) -> SceneNode:
-    if widths is None:
-        return {"type": "conductor", "eta": eta, "k": k}
-    return {"type": "roughconductor", "distribution": "ggx", "eta": eta, "k": k, **widths}
+def _specular(kind: str, widths: SceneNode | None) -> SceneNode:
+    return {"type": kind} if widths is None else {"type": f"rough{kind}", "distribution": "ggx", **widths}
 
 
 def _index(reflectance: float) -> float:

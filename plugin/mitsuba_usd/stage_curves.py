@@ -157,7 +157,9 @@ def read_curves(
 
 
 def _flattened(primvar: UsdGeom.Primvar, time: Usd.TimeCode) -> NDArray[np.float64]:
-    values = np.asarray(primvar.ComputeFlattened(time_of(primvar.GetAttr(), time)), dtype=np.float64)
+    values = np.asarray(primvar.ComputeFlattened(time_of(primvar.GetAttr(), time)))
+    if values.dtype.kind not in "fiu":
+        raise ValueError(f"{primvar.GetName()} is of the type {primvar.GetTypeName()}; expected numbers")
     return _numbers(values, values.shape[1] if values.ndim == 2 else 1)
 
 

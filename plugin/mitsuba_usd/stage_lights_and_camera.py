@@ -124,7 +124,7 @@ def _texture(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> str | 
 def read_camera(
     camera: UsdGeom.Camera, to_world: NDArray[np.float64], time: Usd.TimeCode, notes: StageWarnings
 ) -> CameraContents:
-    """Read a camera with a transform ``(4, 4)`` for column vectors. Raises TypeError, ValueError if it is unusable."""
+    """Read a camera with a transform ``(4, 4)`` for column vectors. Raises ValueError if it is unusable."""
     # Frustums of USD have no scale.
     prim, path = camera.GetPrim(), camera.GetPath()
     x, y, z = to_world[:3, :3].T

@@ -155,8 +155,9 @@ class _StageWalk:
             raise CageError(f'{self._name}: there is no camera "{path}"; expected {expected}')
         to_world = self._to_world(cameras[path].GetPrim())
         try:
+            files.require_types(cameras[path].GetPrim(), self._code)
             return replace(read_camera(cameras[path], to_world, self._code, self._notes), **changes), picture
-        except (TypeError, ValueError):
+        except ValueError:
             expected = "finite numbers, and apertures and a focal length above 0"
             raise CageError(f"{self._location(cameras[path])}: the camera is not usable; expected {expected}") from None
 
@@ -176,7 +177,7 @@ class _StageWalk:
             try:
                 with files.usd_errors_at(location):
                     self._add(prim, str(prim.GetPath()).removeprefix(above), root, to_root, below)
-            except (CageError, AttributeError, TypeError, ValueError) as error:
+            except ValueError as error:
                 message = str(error) if isinstance(error, CageError) else f"{location}: {error}"
                 self._notes.add_message(f"{message}; the prim is left out", prim.GetPath())
         return below

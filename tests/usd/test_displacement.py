@@ -91,8 +91,7 @@ def test_the_camera_of_the_studio_sees_displaced_surfaces(tmp_path, variant_scal
     stages.flat(tmp_path / "heights.png", (255,))
     primvar = PRIMVAR.format([0.1, -0.3, 0.1, 0.1], "vertex")
     for text in (paint(f"{HEIGHT} = -0.3"), paint(HEIGHTS, READER), paint(HEIGHTS, SCALED)):
-        path = stages.write(tmp_path, text + mesh("sheet", SHEET, primvar, bound()))
-        source = StageScenes(path, Look(), {})
+        source = StageScenes(stages.write(tmp_path, text + mesh("sheet", SHEET, primvar, bound())), Look(), {})
         assert np.ptp(source.points(source.at())[:, 2]) == pytest.approx(0.6)
 
 

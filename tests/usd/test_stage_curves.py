@@ -128,6 +128,10 @@ def test_colours_along_curves(tmp_path, interpolation, values, expected, binding
         (("float[] widths", "float[] sizes"), "curves without widths are wires of a thousandth of their size"),
         (("[7, 7]", "[7, 3, 4]"), "curves with too few points are left out"),
         (("point3f[]", f"{moved(scale=(1, 1, 2))}point3f[]"), "curves stay round where transforms stretch them"),
+        (
+            ("float[] widths", "asset primvars:widths = @a@\nfloat[] widths"),
+            "widths is of the type asset; expected numbers",
+        ),
         (("[0.4]", "[0.4, 0.4, 0.4]"), "there are 3 constant widths; expected one for each, 0 or more"),
         (("diffuseColor = (1, 0, 0)", "emissiveColor = (1, 0, 0)"), "emission of curves is ignored"),
     ],

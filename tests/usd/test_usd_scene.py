@@ -659,7 +659,6 @@ def mesh_light(*body):
     return lamp, 50 / 6 * np.pi * rect_form_factor(1.5, 1, 4)
 
 
-# The first of two triangles has a material of its own.
 HALVES = SQUARE.replace("[4]", "[3, 3]").replace("[0, 1, 2, 3]", "[0, 1, 2, 0, 2, 3]") + subset([0])
 LIGHTS = {
     "mesh": mesh_light(SQUARE),
@@ -1039,16 +1038,17 @@ def test_display_colours_of_every_interpolation(scene, scheme):
 
 
 @pytest.mark.parametrize("interpolation", ["vertex", "faceVarying", "constant"])
-@pytest.mark.parametrize(("name", "kind"), [("displayColor", ""), ("paint", "float3"), ("paint", "float4")])
-def test_colours_with_alpha_are_colours(stage, name, kind, interpolation):
+@pytest.mark.parametrize(("kind", "binding"), [("float3", ""), ("float3", bound()), ("float4", bound())])
+def test_colours_with_alpha_are_colours(stage, kind, binding, interpolation):
     """Blender's attributes of colours have four numbers, and Mitsuba's one or three."""
-    values = f"{[(1, 0.5, 0.25, 0.5)] * (1 if interpolation == 'constant' else 4)}"
-    square = SQUARE, f'color4f[] primvars:{name} = {values} (interpolation = "{interpolation}")'
-    reader = shader("color", f"UsdPrimvarReader_{kind}", 'string inputs:varname = "paint"', f"{kind} outputs:result")
-    paint = material("color3f inputs:diffuseColor.connect = </paint/color.outputs:result>", reader) if kind else ""
-    path = stage(CAMERA + SKY + mesh("square", *square, bound() if kind else "") + paint)
-    entries, messages = told(msub.usd_scene, path, mi, size=(4, 4))
-    assert messages[0].endswith(f"alpha of colours is ignored; expected a primvar of its own (/square.primvars:{name})")
+    colors = f"color4f[] primvars:displayColor = {[(1, 0.5, 0.25, 0.5)] * (1 if interpolation == 'constant' else 4)}"
+    reader = shader("r", f"UsdPrimvarReader_{kind}", 'string inputs:varname = "displayColor"', f"{kind} outputs:result")
+    text = material("color3f inputs:diffuseColor.connect = </paint/r.outputs:result>", reader) + CAMERA + SKY
+    path = stage(text + mesh("square", SQUARE, f'{colors} (interpolation = "{interpolation}")', binding))
+    entries, (message,) = told(msub.usd_scene, path, mi, size=(4, 4))
+    assert message.endswith(
+        "alpha of colours is ignored; expected a primvar of its own (/square.primvars:displayColor)"
+    )
     picture = rendered(entries, 256).mean(axis=(0, 1))
     np.testing.assert_allclose(picture / picture[0], [1, 0.5, 0.25], atol=0.08)  # With white reflections
 

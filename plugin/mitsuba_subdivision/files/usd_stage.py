@@ -216,13 +216,13 @@ def value_at(attribute: Usd.Attribute, time: Usd.TimeCode) -> Any:
 
 
 def require_types(prim: Usd.Prim, time: Usd.TimeCode) -> None:
-    """Raise TypeError unless a prim's attributes have the types of its schema; USD reads others as missing."""
+    """Raise ValueError unless a prim's attributes have the types of its schema; USD reads others as missing."""
     for attribute in prim.GetAuthoredAttributes():
         value, declared = value_at(attribute, time), attribute.GetTypeName().defaultValue
         are_numbers = isinstance(value, (int, float)) and isinstance(declared, (int, float))
         if value is not None and declared is not None and not are_numbers and not isinstance(value, type(declared)):
             kind, expected = type(value).__name__, type(declared).__name__
-            raise TypeError(f"{attribute.GetName()} is of the type {kind}; expected {expected}")
+            raise ValueError(f"{attribute.GetName()} is of the type {kind}; expected {expected}")
 
 
 def local_to_world(
