@@ -288,12 +288,12 @@ def cameras(export):
     scene, render, stage = export.scene, export.scene.render, export.stage
     settings = UsdRender.Settings.Define(stage, "/Render/Settings")
     stage.SetMetadata("renderSettingsPrimPath", "/Render/Settings")
-    size = (max(1, side * render.resolution_percentage // 100) for side in (render.resolution_x, render.resolution_y))
+    size = [max(1, side * render.resolution_percentage // 100) for side in (render.resolution_x, render.resolution_y)]
     settings.CreateResolutionAttr(Gf.Vec2i(*size))
     settings.CreatePixelAspectRatioAttr(render.pixel_aspect_x / render.pixel_aspect_y)
-    if render.use_border:
+    if render.use_border:  # Of whole pixels, as in Blender.
         sides = (getattr(render, f"border_{side}") for side in ("min_x", "min_y", "max_x", "max_y"))
-        settings.CreateDataWindowNDCAttr(Gf.Vec4f(*sides))
+        settings.CreateDataWindowNDCAttr(Gf.Vec4f(*(int(a * b) / b for a, b in zip(sides, 2 * size, strict=True))))
     settings.GetPrim().CreateAttribute("cycles:background:transparent", KINDS.Bool).Set(render.film_transparent)
     settings.GetPrim().CreateAttribute("cycles:samples", KINDS.Int).Set(scene.cycles.samples)
     aspect = render.resolution_x * render.pixel_aspect_x / (render.resolution_y * render.pixel_aspect_y)

@@ -210,7 +210,7 @@ def test_animated_properties_have_samples(shown):
 MEAN, DARK = 0.05, 0.004
 # Mitsuba's BSDFs are other models of reflection: see the table of the guide.
 OTHERS, MEAN_OF_OTHERS = ("block_0", "block_2", "block_3", "tile_4"), 0.15
-OPTIONS = {"shown": ["--spp", "16", "--time", "2", "--shutter", "16"]}
+OPTIONS = {"shown": ["--spp", "64", "--time", "2", "--shutter", "4"]}
 
 
 @pytest.mark.parametrize("kind", ["look", "shown", "studio", "houses"])
