@@ -16,6 +16,7 @@ from .errors import CageError, CageSource, number_of_such, shortened
 
 Interpolation = Literal["vertex", "varying", "face_varying"]
 INTERPOLATIONS: tuple[Interpolation, ...] = ("vertex", "varying", "face_varying")
+TEXCOORDS = "texcoords"  # Name of the texture coordinates among the attributes
 
 # Rules of a cage and their values, named as in OpenSubdiv and USD. The first value is the default.
 RULES = {
@@ -152,6 +153,11 @@ class CageContents:
     scheme: str | None = None  # Subdivision scheme that the file names
     # Names of the file, its lines, vertices and faces in messages
     source: CageSource = field(default_factory=CageSource)
+
+
+def attributes_by_name(texcoords: Attribute | None, attributes: Mapping[str, Attribute]) -> dict[str, Attribute]:
+    """All attributes of a cage; the texture coordinates, if there are any, come first."""
+    return {**({} if texcoords is None else {TEXCOORDS: texcoords}), **attributes}
 
 
 def shape_properties(contents: CageContents, mi: Any) -> dict[str, Any]:

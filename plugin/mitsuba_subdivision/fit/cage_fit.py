@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..cage import ControlCage
+from ..cage.contents import TEXCOORDS, attributes_by_name
 from ..device_arrays import upload
 from ..mesh.connectivity import IntArray
 from ..refinement.cage_refinement import CageRefinement, built
@@ -25,7 +26,7 @@ from .unknown_creases import UnknownCreases
 
 # Names in the scene of the fitted shape and its control points, and prefix of its attributes.
 SHAPE = "surface"
-CONTROL_POINTS, CAGE_VALUES, TEXCOORDS = f"{SHAPE}.control_points", f"{SHAPE}.cage_", "texcoords"
+CONTROL_POINTS, CAGE_VALUES = f"{SHAPE}.control_points", f"{SHAPE}.cage_"
 # Variables of the optimiser: coordinates of control points, and sharpness of creases.
 U, SHARPNESS = "u", "sharpness"
 # Moving outlines need a projective integrator. Few scenes need gradients of shadows.
@@ -253,14 +254,13 @@ class CageFit(Fit):
         names = [name.removeprefix(CAGE_VALUES) for name in self._other_names if name.startswith(CAGE_VALUES)]
         if not names:
             return self._start.with_positions(self.control_points)
-        contents = self._start.contents
-        known = {TEXCOORDS: contents.texcoords, **contents.attributes}
-        fitted: dict[str, Any] = {name: attribute for name, attribute in known.items() if attribute is not None}
+        start = self._start.contents
+        fitted = attributes_by_name(start.texcoords, start.attributes)
         for name in names:
             values = np.array(self._others[f"{CAGE_VALUES}{name}"], dtype=np.float64)
             fitted[name] = replace(fitted[name], values=values.reshape(fitted[name].values.shape))
         texcoords = fitted.pop(TEXCOORDS, None)
-        return built(replace(contents, positions=self.control_points, texcoords=texcoords, attributes=fitted))
+        return built(replace(start, positions=self.control_points, texcoords=texcoords, attributes=fitted))
 
     @property
     def sharp_edges(self) -> IntArray:

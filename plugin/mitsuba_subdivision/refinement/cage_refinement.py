@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.contents import RULES, Attribute, CageContents
+from ..cage.contents import RULES, TEXCOORDS, Attribute, CageContents, attributes_by_name
 from ..cage.control_cage import ControlCage, cage_of
 from ..cage.errors import CageError, CageSource, shortened, without_warnings
 from ..mesh import ragged
@@ -28,8 +28,6 @@ from .adapted_scheme import adapted_scheme, subdivided_values
 
 if TYPE_CHECKING:
     from scipy import sparse
-
-TEXCOORDS = "texcoords"
 
 # Tolerance when comparing sharpness. Chaikin's method averages a few numbers below ten, whose order may differ.
 MEAN_TOLERANCE = 1e-13
@@ -319,8 +317,7 @@ def refined_attributes(
     """
     attributes: dict[str, Attribute] = {}
     value_meshes: dict[str, ValueMesh] = {}
-    given = cage.attributes if cage.texcoords is None else {TEXCOORDS: cage.texcoords, **cage.attributes}
-    for name, attribute in given.items():
+    for name, attribute in attributes_by_name(cage.texcoords, cage.attributes).items():
         values, indices = attribute.values, attribute.indices
         if attribute.interpolation == "vertex":
             attributes[name] = Attribute(matrix @ values)

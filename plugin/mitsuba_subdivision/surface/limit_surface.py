@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ..cage import ControlCage
-from ..cage.contents import Attribute
+from ..cage.contents import TEXCOORDS, attributes_by_name
 from ..cage.errors import CageError
 from ..evaluation.element import SurfaceSamples, derivative_stencils
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
@@ -42,9 +42,6 @@ if TYPE_CHECKING:
 
     from ..kernels.surface_kernel import SurfaceKernel
     from ..tessellation.criterion import Criterion
-
-# Name of the texture coordinates among the attributes.
-TEXCOORDS = "texcoords"
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,12 +200,7 @@ class LimitSurface:
     @property
     def attribute_names(self) -> tuple[str, ...]:
         """Names of the cage's attributes; of its texture coordinates first, if it has any."""
-        return tuple(self._attributes)
-
-    @property
-    def _attributes(self) -> dict[str, Attribute]:
-        texcoords = self.cage.texcoords
-        return {**({} if texcoords is None else {TEXCOORDS: texcoords}), **self.cage.attributes}
+        return tuple(attributes_by_name(self.cage.texcoords, self.cage.attributes))
 
     def channel(self, name: str) -> Channel:
         """The interpolation of an attribute, or of the texture coordinates ("texcoords"), over the elements.
@@ -217,7 +209,7 @@ class LimitSurface:
         the scheme has no rules for it.
         """
         if name not in self._channels:
-            attributes = self._attributes
+            attributes = attributes_by_name(self.cage.texcoords, self.cage.attributes)
             if name not in attributes:
                 expected = f"one of {', '.join(attributes)}" if attributes else "a cage with attributes"
                 raise ValueError(f'{self.cage.source.name} has no attribute "{name}"; expected {expected}')
