@@ -248,8 +248,7 @@ def pictures(target: Triangles, spp: int = TARGET_SPP) -> list[View]:
 
 
 def fitted_cage(target: Triangles, views: list[View], course: Course, seed: int, steps: int) -> Result:
-    clock = [time.perf_counter()]
-    folds = [(steps // 4 + 1, 0), (steps, FOLDS)]
+    clock, folds = [time.perf_counter()], [(steps // 4 + 1, 0), (steps, FOLDS)]
     options = {"shape": {"bsdf": BSDF}, "refine": [steps // 4], "spp": SPP, "edge_spp": EDGE_SPP, "seed": 1000 * seed}
     options |= {"learning_rate": course.schedule(steps), "smoothing": LAMBDA}
     options["regularizers"] = {"bending": course.schedule(steps, course.bending), "folds": folds}

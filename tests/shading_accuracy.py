@@ -57,8 +57,7 @@ def hits(name: str, rate: int, shading: str, resolution: int) -> dict[str, np.nd
     scene = mi.load_dict({"type": "scene", "sensor": sensor, "shape": {**shape, "shading": shading}})
     y, x = (np.indices((resolution, resolution)).reshape(2, -1) + 0.5) / resolution
     ray, _ = scene.sensors()[0].sample_ray(0.0, 0.5, mi.Point2f(x, y), mi.Point2f(0.5))
-    si = scene.ray_intersect(ray)
-    box = scene.bbox()
+    si, box = scene.ray_intersect(ray), scene.bbox()
     values = {"p": si.p, "n": si.sh_frame.n, "d": ray.d, "hit": si.is_valid(), "size": box.max - box.min}
     return {key: np.array(value).T for key, value in values.items()}
 

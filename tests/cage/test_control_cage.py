@@ -99,8 +99,7 @@ def test_validation_errors_of_a_file_name_its_line(obj_file):
 
 
 def test_properties_are_mitsuba_tensors():
-    mi = mitsuba.scalar_rgb
-    cage = torus(3, 4)
+    mi, cage = mitsuba.scalar_rgb, torus(3, 4)
     properties = cage.as_properties(mi)
     types = {"positions": mi.TensorXd, "face_sizes": mi.TensorXu, "face_vertices": mi.TensorXu}
     assert {name: type(properties[name]) for name in types} == types

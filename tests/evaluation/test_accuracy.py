@@ -111,8 +111,7 @@ def test_any_element_and_corner_match_explicit_refinement(scheme, name, np_rng):
     sizes = surface.patches.elements.face_sizes
     # Every element of cages that have not too many.
     element = np.resize(np_rng.permutation(len(sizes)), SAMPLES)
-    corner = np_rng.integers(0, sizes[element])
-    uv = np_rng.random((SAMPLES, 2))
+    corner, uv = np_rng.integers(0, sizes[element]), np_rng.random((SAMPLES, 2))
     if scheme == "loop":
         uv[uv.sum(axis=1) > 1] = 1 - uv[uv.sum(axis=1) > 1]
     else:
@@ -147,8 +146,7 @@ def test_translation_changes_normals_by_rounding_of_the_cage_at_most(exact):
 @pytest.mark.parametrize("valence", range(3, 9))
 def test_limit_stencils_match_the_published_numbers(scheme, valence):
     published = json.loads((Path(__file__).parents[1] / "data" / "limit_stencils.json").read_text())
-    entry = published[scheme][str(valence)]
-    stencil = limit_stencil(scheme, valence)
+    entry, stencil = published[scheme][str(valence)], limit_stencil(scheme, valence)
     names = ("limit_position", "tangent1", "tangent2")
     for name, weights in zip(names, (stencil.position, *stencil.tangents), strict=True):
         # The extraordinary point of Doo-Sabin is a face's, and has no vertex in its centre.

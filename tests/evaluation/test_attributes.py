@@ -191,8 +191,7 @@ def test_without_seams_values_are_subdivided_as_points_are(scheme, cage, np_rng)
 @pytest.mark.core
 @EVERY_CAGE
 def test_linear_values_are_bilinear_over_each_face(scheme, cage, np_rng):
-    t = cage.topology
-    values = np_rng.random((cage.vertex_count, 2))
+    t, values = cage.topology, np_rng.random((cage.vertex_count, 2))
     texcoords, varying = face_varying(values, cage.face_vertices), Attribute(values, "varying")
     given = tagged(cage, face_varying="all", texcoords=texcoords, attributes={"varying": varying})
     surface = LimitSurface(given, scheme)

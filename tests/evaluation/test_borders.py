@@ -58,8 +58,7 @@ PATCHES = {
 def test_results_do_not_depend_on_signs_of_eigenvectors(scheme, cage, np_rng, monkeypatch):
     surface = LimitSurface(cage, scheme)
     places = at_corners(surface, np_rng)
-    expected = surface.evaluate(*places)
-    computed = irregular_patch.eigenbasis
+    expected, computed = surface.evaluate(*places), irregular_patch.eigenbasis
 
     def clear_caches():
         for function in (patch_tree.irregular_patch, patch_tree.patch_tree):
@@ -84,8 +83,7 @@ def test_a_corner_of_two_triangles_is_touched_by_the_plane_of_its_border_edges()
     """The edge between the two triangles contracts faster, so the plane need not hold it."""
     corner, first, middle, last = np.array([(0, 0, 0), (1, 0, 0.1), (0.8, 0.9, 0.7), (-0.1, 1, 0.2)])
     cage = ControlCage([corner, first, middle, last], [(0, 1, 2), (0, 2, 3)], corners=[(0, INFINITE)])
-    surface = LimitSurface(cage, "loop")
-    expected = np.cross(first - corner, last - corner)
+    surface, expected = LimitSurface(cage, "loop"), np.cross(first - corner, last - corner)
     for face in range(2):
         # At the corner itself, and so near that the difference is beyond rounding.
         normals = surface.evaluate(face, [(0.0, 0.0), (2.0**-200, 2.0**-200)]).n

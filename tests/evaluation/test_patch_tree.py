@@ -21,8 +21,7 @@ SCHEME = CatmullClark()
 @pytest.mark.parametrize("valence", [2, 3, *range(5, 13)])
 def test_old_and_new_points_of_one_refinement_are_as_many_as_published(valence):
     """And an isolated extraordinary vertex needs no refinement, whichever corner of the element it is."""
-    patch = patch_of("catmull_clark", valence)
-    old = 2 * valence + 8
+    patch, old = patch_of("catmull_clark", valence), 2 * valence + 8
     assert patch.matrix.shape == (old, old)
     assert patch.children.shape == (3, 16, old)
     assert len(np.unique(np.vstack([patch.matrix, *patch.children]), axis=0)) == 2 * valence + 17

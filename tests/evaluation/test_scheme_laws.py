@@ -39,8 +39,7 @@ class Bilinear(Scheme):
         t = topology
         smooth = CatmullClark().refine(t)
         edges, faces = t.vertex_count + t.edge, t.vertex_count + t.edge_count + t.face
-        first = t.edge_half_edge
-        vertices = np.arange(t.vertex_count)
+        first, vertices = t.edge_half_edge, np.arange(t.vertex_count)
         stencils = StencilTable.of(
             smooth.topology.vertex_count,
             t.vertex_count,

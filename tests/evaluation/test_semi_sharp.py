@@ -84,8 +84,7 @@ def test_results_do_not_depend_on_a_schemes_numbering_of_faces(np_rng):
     cage = bumpy(tagged(cube(), creases=creases, crease_method="chaikin"))
     scheme = RolledFaces()
     scheme.crease_method = "chaikin"
-    signature = LimitSurface(cage).patches.classes[0].signature
-    uv = np_rng.random((20, 2))
+    signature, uv = LimitSurface(cage).patches.classes[0].signature, np_rng.random((20, 2))
     expected, rolled = (element_stencils(s, signature, uv) for s in (LimitSurface(cage).scheme, scheme))
     assert np.abs(rolled - expected).max() <= POSITION
 

@@ -29,8 +29,7 @@ def distance(surface, other):
 
 @pytest.mark.parametrize("with_normals", [False, True])
 def test_a_surface_is_found_from_its_points(target, with_normals):
-    points = target.sample(600, 1)
-    start = moved(target.cage)
+    points, start = target.sample(600, 1), moved(target.cage)
     assert distance(LimitSurface(start), target) > 50 * FOUND
 
     def made(start, order=slice(None)):
@@ -82,8 +81,7 @@ def test_a_refined_cage_fits_better():
 
 
 def test_unconstrained_control_points_stay(target):
-    start = moved(target.cage)
-    points = target.sample(4000, 1)
+    start, points = moved(target.cage), target.sample(4000, 1)
     few = points.p[points.element == 0]
     fit = PointFit(start, few, both_ways=False, regularizers={"bending": 0}).run(1)
     near = LimitSurface(start).closest_point(few)

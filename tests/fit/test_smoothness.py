@@ -56,8 +56,7 @@ def test_gradients_of_folds_are_differences(np_rng):
     dr.enable_grad(flat)
     dr.backward(folds(cage)(flat))
     gradient = np.array(dr.grad(flat))
-    flat = points.ravel()
-    moved = STEP * np.eye(points.size)
+    flat, moved = points.ravel(), STEP * np.eye(points.size)
     expected = [(value(cage, flat + move) - value(cage, flat - move)) / (2 * STEP) for move in moved]
     assert np.abs(gradient).max() > 0.1
     np.testing.assert_allclose(gradient, expected, atol=DIFFERENCE)
@@ -114,8 +113,7 @@ def test_regularizers_are_quadratic_forms_of_these_matrices(surface, np_rng, nam
     laplacian, count = cage.laplacian(), cage.vertex_count
     mean_square = laplacian.T @ laplacian / count
     matrix = {"laplacian": mean_square, "bending": surface.bending(), "anchor": np.eye(count) / count}[name]
-    product = matrix @ away
-    flat = upload(mi.Float, points)
+    product, flat = matrix @ away, upload(mi.Float, points)
     dr.enable_grad(flat)
     value = regularizer(name, surface)(flat)
     dr.backward(value)

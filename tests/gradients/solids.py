@@ -33,8 +33,7 @@ def of_triangles(types, positions, triangles):
 def derivatives_of(surface, directions, rate, types):
     """Integrals over a tessellation, and their derivatives, for each of some directions of the control points."""
     table = surface.sampling(rate)
-    kernel = VertexKernel(table, types.float)
-    derivatives = []
+    kernel, derivatives = VertexKernel(table, types.float), []
     for direction in directions:
         points = types.floats(surface.cage.positions.ravel())
         dr.enable_grad(points)

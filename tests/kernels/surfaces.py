@@ -138,8 +138,7 @@ def aimed(surface, rng, count, *, steep=0.3, near=0.05, deepest=4):
     d = rng.normal(size=(count, 3))
     d /= np.linalg.norm(d, axis=1)[:, None]
     kept = np.abs((d * target.n).sum(axis=1)) > steep
-    domain = surface.scheme.domain
-    start = uv + rng.uniform(-near, near, uv.shape)
+    domain, start = surface.scheme.domain, uv + rng.uniform(-near, near, uv.shape)
     start += np.maximum(-start, 0)
     beyond = np.maximum(domain.extent(start) - 1, 0)[:, None]
     start = np.clip(start - beyond, 0, 1)

@@ -91,8 +91,7 @@ def test_rays_meet_points_next_to_extraordinary_ones_in_single_precision(cage, s
     kernel, t = surface.on_device(SINGLE), surface.patches.elements
     half_edge = np_rng.choice(np.flatnonzero(np.bincount(cage.face_vertices)[cage.face_vertices] == 3), 500)
     element = t.face[half_edge].astype(np.int64)
-    corner = half_edge - t.face_offsets[element]
-    uv = np_rng.random((500, 2)) * 2.0**-depth
+    corner, uv = half_edge - t.face_offsets[element], np_rng.random((500, 2)) * 2.0**-depth
     target = surface.evaluate(element, uv, corner)
     hits = hit(kernel, target.p + 0.1 * target.n, -target.n, element, uv, corner)
     assert np.isfinite(np.array(hits.t)).mean() > 0.98

@@ -1,3 +1,5 @@
+from functools import partial
+
 import drjit as dr
 import numpy as np
 import pytest
@@ -28,12 +30,15 @@ def test_weighted_values_and_derivatives_are_products(float_type, rounding, weig
     np.testing.assert_allclose(derivative, (weights @ change).ravel(), rtol=0, atol=rounding)
 
 
+def made(table, float_type):
+    return SparseMatrix(table(), float_type)
+
+
 def test_looked_up_values_follow_in_place(float_type, rounding, weights, np_rng):
     types = ArrayTypes(float_type)
     first, second = np_rng.random((2, COLUMNS, 3))
-    values = ControlValues(types, 3, SparseMatrix(weights, types.float)).load(first)
-    flat = values.flat
-    given = upload(float_type, second)
+    values = ControlValues(types, 3, made, partial(weights.copy)).load(first)
+    flat, given = values.flat, upload(float_type, second)
     dr.enable_grad(given)
     assert not dr.grad_enabled(flat)
     values.set(given)
@@ -47,11 +52,10 @@ def test_looked_up_values_follow_in_place(float_type, rounding, weights, np_rng)
 
 
 def test_equal_values_share_arrays_until_they_are_set(float_type, rounding, weights, np_rng):
-    types, matrix = ArrayTypes(float_type), SparseMatrix(weights, float_type)
-    values = np_rng.random((COLUMNS, 3))
-    first, second = (ControlValues(types, 3, matrix).load(values.copy()) for _ in range(2))
-    other = ControlValues(types, 3, matrix).load(values + 1)
-    apart = ControlValues(types, 3, SparseMatrix(weights, float_type)).load(values)
+    types, values, table = ArrayTypes(float_type), np_rng.random((COLUMNS, 3)), partial(weights.copy)
+    first, second = (ControlValues(types, 3, made, table).load(values.copy()) for _ in range(2))
+    other = ControlValues(types, 3, made, table).load(values + 1)
+    apart = ControlValues(types, 3, made, partial(weights.copy)).load(values)
     kept = np.array(second.flat)
     assert first.flat is not second.flat
     assert first.flat.index == second.flat.index

@@ -43,8 +43,7 @@ def carried(kernel, location):
 def every_side(surface, rng):
     """Half-edges, parameters seen from them beyond each side, and whether there is a neighbour."""
     t, domain = surface.patches.elements, surface.scheme.domain
-    is_whole = surface.patches.is_whole[t.face]
-    every = np.arange(t.half_edge_count)
+    is_whole, every = surface.patches.is_whole[t.face], np.arange(t.half_edge_count)
     for side in range(domain.corner_count):
         edge = every
         for _ in range(side):
@@ -138,8 +137,7 @@ def test_neighbouring_triangles_share_the_points_of_their_edge(name, rate, np_rn
         for k in range(3):
             edges[corners[k], corners[(k + 1) % 3]] = triangle, k
     pairs = [(edges[a, b], edges[b, a]) for a, b in edges if a < b and (b, a) in edges]
-    along = np_rng.random(len(pairs))
-    sides = []
+    along, sides = np_rng.random(len(pairs)), []
     for number, share in ((0, along), (1, 1 - along)):
         triangle, k = np.array([pair[number] for pair in pairs]).T
         weights = np.zeros((len(pairs), 3))

@@ -73,8 +73,7 @@ def test_gathered_ring_is_a_map_of_meshes(topology, kind):
         faces |= {face[i:] + face[:i]: index for i in range(len(face))}
     for half_edge in half_edges_of(topology):
         ring = one_ring(signature_at(topology, half_edge, kind))
-        controls = gathered(ring, topology, [half_edge])[0]
-        local = ring.topology
+        controls, local = gathered(ring, topology, [half_edge])[0], ring.topology
         element = element_vertices(topology, half_edge, kind)
         assert tuple(controls[: len(element)]) == element
         assert tuple(local.face_vertices[: len(element)]) == tuple(range(len(element)))

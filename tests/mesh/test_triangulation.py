@@ -32,8 +32,7 @@ def test_triangles_of_a_polygon_cover_its_area_once_with_its_orientation(polygon
     for rotation, start in turned(12, len(flat), 0):
         corners, face = triangle_corners(np.roll(flat, start, axis=0) @ rotation.T + 3, *one)
         a, b, c = (np.roll(flat, start, axis=0)[corner] for corner in corners.T)
-        areas = np.cross(b - a, c - a)[:, 2] / 2
-        area = signed_area(flat[:, :2])
+        areas, area = np.cross(b - a, c - a)[:, 2] / 2, signed_area(flat[:, :2])
         # Unsigned areas add up to the polygon's only if no triangle overlaps another, or lies outside.
         np.testing.assert_allclose([areas.sum(), np.abs(areas).sum()], [area, abs(area)], rtol=ROUNDING)
         assert not face.any()

@@ -116,8 +116,7 @@ HIGH = pytest.param("valence 50", marks=pytest.mark.long)
 
 @pytest.mark.parametrize("name", ["valence 3", HIGH, "dart", "loop valence 3", "doo_sabin mixed torus"])
 def test_points_above_places_at_and_next_to_extraordinary_ones(name, np_rng):
-    surface = surface_named(name)
-    deep = np.repeat([2.0**-8, 2.0**-40, 0], 2)[:, None]
+    surface, deep = surface_named(name), np.repeat([2.0**-8, 2.0**-40, 0], 2)[:, None]
     domain = surface.scheme.domain
     uv = deep * (np_rng.dirichlet(np.ones(domain.corner_count), len(deep)) @ domain.corners)
     element = 0 if surface.scheme.element == "face" else int(np.argmax(surface.patches.elements.face_sizes != 4))

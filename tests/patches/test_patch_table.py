@@ -41,8 +41,7 @@ def test_classes_group_patches_by_signature_and_one_ring(scheme, cage):
     for patch_class in table.classes:
         assert len(set(table.is_whole[table.elements.face[patch_class.corners]])) == 1
         assert {*signatures_of(table, patch_class.corners)} == {patch_class.signature}
-        ring = one_ring(patch_class.signature)
-        of_class = table.controls_of(patch_class)
+        ring, of_class = one_ring(patch_class.signature), table.controls_of(patch_class)
         assert of_class.shape == (len(patch_class.corners), ring.vertex_count)
         half_edges = table.half_edge_of_corner[patch_class.corners]
         for controls, half_edge in zip(of_class, half_edges, strict=True):
@@ -76,8 +75,7 @@ def test_patches_of_a_class_see_the_same_near_faces_of_large_fans(scheme):
 
 @EVERY_SURFACE
 def test_classes_do_not_depend_on_numbering_and_first_corners(scheme, name):
-    cage = cage_of(scheme, name)
-    rng = np.random.default_rng(8)
+    cage, rng = cage_of(scheme, name), np.random.default_rng(8)
     number = rng.permutation(cage.vertex_count)
     faces = [np.roll(number[list(face)], rng.integers(len(face))) for face in polygons(cage.topology)]
     faces = [faces[i] for i in rng.permutation(len(faces))]

@@ -223,8 +223,7 @@ def book(pages, triangles=False, **options):
     """Sheets of 3 by 2 quads that share their first row of vertices, 0 to 3; page k has 4 + 8 k and so on."""
     positions, faces = [[i, 0, 0.1 * i * i] for i in range(4)], []
     for page in range(pages):
-        turn = np.pi * page / pages
-        before = list(range(4))
+        turn, before = np.pi * page / pages, list(range(4))
         for row in (1, 2):
             here = list(range(len(positions), len(positions) + 4))
             positions += [[i, row * np.cos(turn), row * np.sin(turn)] for i in range(4)]

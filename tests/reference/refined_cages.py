@@ -74,8 +74,7 @@ def refined(surface):
     """The surface of the cut mesh refined once; its element at each half-edge is the corner there."""
     cut = surface.cage.cut_mesh
     refinement = surface.scheme.refine(cut.topology)
-    t = refinement.topology
-    points = refinement.apply(surface.cage.positions[cut.vertex])
+    t, points = refinement.topology, refinement.apply(surface.cage.positions[cut.vertex])
     cage = ControlCage.from_arrays(points, t.face_sizes, t.face_vertices, boundary="edge_only")
     # Its own rules and edges: what a cage of these faces has not.
     structure = replace(cage.structure, topology=t)

@@ -18,8 +18,7 @@ RANGES = "expected a seed, the samples of a batch, and ranges"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("images")
-    small = [*SMALL, "--batch", "16"]
+    path, small = tmp_path_factory.mktemp("images"), [*SMALL, "--batch", "16"]
     assert main(["render", SCENE, "-o", str(path / "reference.exr"), "--reference", "--spp", "512", *small]) == 0
     stam = ["-D", "evaluator=stam", "-D", "sample_offset=1e-6"]
     assert main(["render", SCENE, "-o", str(path / "stam.exr"), "--reference", "--spp", "32", *small, *stam]) == 0

@@ -336,8 +336,7 @@ def test_references_without_a_sampler_prove_nothing_after_a_change(reference, np
 @pytest.mark.parametrize(("flips", "factor", "status"), [(0.02, 1, "pass"), (0.02, 1.03, "fail"), (0, 1, "pass")])
 def test_images_of_the_same_samples_have_the_noise_of_rounding(reference, np_rng, flips, factor, status):
     """One batch in fifty of a pixel is another; a texel that is 3 % brighter is far below the noise of the images."""
-    paired = reference.paired.copy()
-    other = np_rng.random((SIZE, SIZE)) < flips
+    paired, other = reference.paired.copy(), np_rng.random((SIZE, SIZE)) < flips
     paired[other] = estimate(np_rng, 1).stored().mean[other]
     noise = SPREAD * truth() / np.sqrt(BATCH) * np_rng.standard_normal((SIZE, SIZE, 3)) * np.sqrt(2 * flips / 400)
     pixels = reference.pixels + noise

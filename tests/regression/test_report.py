@@ -22,8 +22,7 @@ SPOT = (0.9, 0.02, 0.02)
 @pytest.fixture(scope="module")
 def failed():
     """A bright red square that the reference does not have, in an image of grey."""
-    rng = np.random.default_rng(3)
-    mean = truth()
+    rng, mean = np.random.default_rng(3), truth()
     mean[8:16, 8:16] = np.array(SPOT) * 2
     return compare(random_image(rng, 400, "reference"), random_image(rng, 8, "test <1>", mean=mean))
 

@@ -300,8 +300,7 @@ def test_normals_are_continuous_at_extraordinary_vertices(valence, scale, beside
     (corner, uv), truth = locations(cage), Truth(cage, "vertex_height")
     at = np.flatnonzero((uv == 0).all(axis=1))
     at = at[truth.surface._sampler.evaluate(corner[at], uv[at]).level == AT_EXTRAORDINARY_POINT]
-    t = truth.surface.patches.elements
-    turns = [corner[at]]
+    t, turns = truth.surface.patches.elements, [corner[at]]
     for _ in range(valence - 1):
         turns.append(t.twin[t.prev[turns[-1]]])
     of_valence = (t.twin[t.prev[turns[-1]]] == turns[0]) & np.all([turn != turns[0] for turn in turns[1:]], axis=0)

@@ -131,8 +131,7 @@ def test_gradients_of_views_add_up(names, displacement, shading):
 def test_assigned_vertices_stay_when_gradients_pass():
     scene, key = views_of("prb"), "shape.vertex_positions"
     parameters = mi.traverse(scene)
-    points = differentiated(parameters, KEY)
-    attached = mi.Float(parameters[key])
+    points, attached = differentiated(parameters, KEY), mi.Float(parameters[key])
     update(parameters, {key: dr.detach(attached) * 2})
     dr.backward(dr.sum(attached))
     assert np.abs(np.array(dr.grad(points))).max() > 0

@@ -203,8 +203,7 @@ def test_a_surface_folded_in_its_plane_is_covered(name):
 def test_tiles_do_not_depend_on_the_blocks_that_bound_their_memory(monkeypatch):
     """And no block has more patches than it may: a class at its end is cut."""
     surface, most, sizes = surface_named("rook"), 7, []
-    whole = table_of(surface, 1e-2, 64).triangles
-    whole_patches = adaptive._whole_patches
+    whole, whole_patches = table_of(surface, 1e-2, 64).triangles, adaptive._whole_patches
 
     def counted(*arguments):
         for part in whole_patches(*arguments):

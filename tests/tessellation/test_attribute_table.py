@@ -85,8 +85,7 @@ def lattice(surface, element, rate):
 def test_vertices_are_split_where_seams_or_creases_are_only(scheme, cage, np_rng):
     cage = with_seams(bumpy(cage), np_rng)
     surface = LimitSurface(cage, scheme)
-    mesh = surface.tessellate(3)
-    t = cage.topology
+    mesh, t = surface.tessellate(3), cage.topology
     seam = surface.channel("texcoords").layout.seam | surface.channel("other_seams").layout.seam
     cut = ((seam | cage.tags.is_infinite) & (t.twin >= 0)).sum() + (t.twin < 0).sum()
     edges = np.concatenate([mesh.triangles[:, [i, i - 1]] for i in range(3)])
