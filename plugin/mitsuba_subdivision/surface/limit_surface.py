@@ -43,8 +43,7 @@ if TYPE_CHECKING:
     from ..kernels.surface_kernel import SurfaceKernel
     from ..tessellation.criterion import Criterion
 
-# Name of the texture coordinates among the attributes.
-TEXCOORDS = "texcoords"
+TEXCOORDS = "texcoords"  # Name of the texture coordinates among the attributes
 
 
 @dataclass(frozen=True, eq=False)
