@@ -21,19 +21,14 @@ exclude_patterns = ["mitsuba_subdivision", "mitsuba_usd", "reference/build", "**
 
 myst_enable_extensions = ["dollarmath", "html_image"]
 myst_fence_as_directive = ["mermaid"]
-# Deep enough for all linked headings, with GitHub's names.
-myst_heading_anchors = 3
-# Stored outputs of notebooks; the tests run them.
-nb_execution_mode = "off"
+myst_heading_anchors = 3  # Deep enough for all linked headings, with GitHub's names
+nb_execution_mode = "off"  # Stored outputs of notebooks; the tests run them
 
 autodoc_default_options = {"members": True, "member-order": "bysource"}
-# Types are in the docstrings, with the shapes of arrays.
-autodoc_typehints = "none"
+autodoc_typehints = "none"  # Types are in the docstrings, with the shapes of arrays
 autodoc_preserve_defaults = True
-# Members have separate entries.
-numpydoc_show_class_members = False
-# Names between backticks are links if the reference has them.
-default_role = "py:obj"
+numpydoc_show_class_members = False  # Members have separate entries
+default_role = "py:obj"  # Names between backticks are links if the reference has them
 
 _TOP = Path(__file__).resolve().parents[1]
 
@@ -56,8 +51,7 @@ def _from_here(_app, page, source):
 
 
 def _is_skipped(_app, _what, _name, member, _skip, _options):
-    # None: left to Sphinx.
-    return True if (member.__doc__ or "").startswith("Alias for field number") else None
+    return True if (member.__doc__ or "").startswith("Alias for field number") else None  # None: left to Sphinx
 
 
 def _link_names(app, tree, page):

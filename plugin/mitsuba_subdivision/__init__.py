@@ -11,8 +11,7 @@ from pathlib import Path
 
 from .llvm import select_llvm
 
-# Before Mitsuba loads Dr.Jit, which uses the first LLVM library that it finds.
-select_llvm()
+select_llvm()  # Before Mitsuba loads Dr.Jit, which uses the first LLVM library that it finds
 
 from .shapes import register, register_variant  # noqa: E402, F401 - see above
 

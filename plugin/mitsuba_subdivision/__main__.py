@@ -61,8 +61,7 @@ def interruptible(work: Callable[[], T]) -> T:
     try:
         future = executor.submit(contextvars.copy_context().run, work)
         while wait([future], INTERVAL).not_done:
-            # During a render, Mitsuba installs a handler that waits for the end of the render.
-            if handler is not None:
+            if handler is not None:  # During a render, Mitsuba installs a handler that waits for the end of the render
                 signal.signal(signal.SIGINT, handler)
     except KeyboardInterrupt:
         _abandon()

@@ -58,8 +58,7 @@ def select_llvm() -> LlvmChoice:
     with an exception instead of ending the process. If there is none, or no Linux, Dr.Jit searches by its own rules.
     """
     chosen = os.environ.get(ENVIRONMENT_VARIABLE)
-    # Set by a parent process that found no usable library.
-    if chosen and chosen != NO_USABLE_LLVM:
+    if chosen and chosen != NO_USABLE_LLVM:  # Set by a parent process that found no usable library
         return LlvmChoice(chosen, library_version(chosen), f"{ENVIRONMENT_VARIABLE} is set")
     if "drjit" in sys.modules:
         return LlvmChoice(None, loaded_version(), _TOO_LATE)
@@ -169,8 +168,7 @@ def _known_version(path: str) -> int:
     except OSError:
         return 0
     if not hasattr(library, "LLVMGetVersion"):
-        # `LLVMGetVersion` exists since LLVM 16.
-        return 15 if hasattr(library, "LLVMGetGlobalContext") else 0
+        return 15 if hasattr(library, "LLVMGetGlobalContext") else 0  # `LLVMGetVersion` exists since LLVM 16
     major = ctypes.c_uint()
     library.LLVMGetVersion(ctypes.byref(major), None, None)
     return major.value

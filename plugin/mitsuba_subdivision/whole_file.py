@@ -33,8 +33,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     with _temporary(path) as beside:
         try:
             yield beside
-            # Wait for the disk: some systems report a full disk only then.
-            with beside.open("r+b") as stream:
+            with beside.open("r+b") as stream:  # Wait for the disk: some systems report a full disk only then
                 os.fsync(stream.fileno())
             beside.replace(path)
         except (OSError, RuntimeError) as error:

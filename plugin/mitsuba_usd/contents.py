@@ -63,8 +63,7 @@ class MaterialError(ValueError):
 
 Part = TypeVar("Part", "ShapeContents", "LightContents")
 Source = TextureContents | PrimvarContents | NodeContents
-# A number, a colour, an option, or the source of a value that varies.
-Input = float | list[float] | str | Source
+Input = float | list[float] | str | Source  # A number, a colour, an option, or the source of a value that varies
 
 
 def parts(given: Input) -> list[Source]:
@@ -89,8 +88,7 @@ class MaterialContents:
     """A material: inputs of `surface_models.NEUTRAL` that differ from their defaults, or a BSDF of Mitsuba."""
 
     name: str  # Path of the prim
-    # Also "bsdf", and "displacement" and "displacement_scale" in units of the shape
-    inputs: dict[str, Input]
+    inputs: dict[str, Input]  # Also "bsdf", and "displacement" and "displacement_scale" in units of the shape
 
     @property
     def is_emissive(self) -> bool:

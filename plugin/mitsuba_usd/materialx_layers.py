@@ -110,8 +110,7 @@ def _beside(path: str, document: str) -> str:
     if is_packed:
         return str(Ar.JoinPackageRelativePath([package, beside]))
     absolute = str(Ar.GetResolver().CreateIdentifier(path, Ar.ResolvedPath(document)))
-    # USD keeps paths of missing files, such as patterns of tiles.
-    return absolute if absolute != path else beside
+    return absolute if absolute != path else beside  # USD keeps paths of missing files, such as patterns of tiles
 
 
 def _add_material(stage: Usd.Stage, node: MaterialX.Node) -> None:

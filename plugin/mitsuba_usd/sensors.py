@@ -17,8 +17,7 @@ from .stage_warnings import StageWarnings
 
 _LEAST_NEAR = 1e-6
 NO_BLUR = "shutters of cameras have no effect without the option --shutter of render"
-# Default width of pictures by a stage's camera, in pixels.
-WIDTH = 640
+WIDTH = 640  # Default width of pictures by a stage's camera, in pixels
 RESERVED = ("integrator", "sensor", *STUDIO, ENVIRONMENT)
 _LEAST_SIZE = 1e-6  # Minimum half-extent of the framed content, relative to its position
 

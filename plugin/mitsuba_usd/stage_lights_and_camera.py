@@ -23,8 +23,7 @@ _KINDS: dict[str, tuple[str, ...]] = {
     "DomeLight": ("dome",),
     "DomeLight_1": ("dome",),
 }
-# Largest angle in degrees of distant lights without a warning: twice the Sun's.
-_POINTLIKE = 1.0
+_POINTLIKE = 1.0  # Largest angle in degrees of distant lights without a warning: twice the Sun's
 _CONE = "inputs:shaping:cone:angle"
 # Ignored attributes of lights, their values without effect, and the reason.
 _EVERYWHERE = "Mitsuba's area lights shine in all directions"

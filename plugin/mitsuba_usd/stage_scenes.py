@@ -145,8 +145,7 @@ class StageScenes(studio.SceneSource[SceneContents]):
         displaced = [shape for shape in contents.all_shapes if shape.is_displaced]
         if not displaced or contents.camera is not None or "displacement" in self._parameters:
             return self._surfaces.points(contents)
-        # The studio's camera sees displaced surfaces.
-        textures = Textures(self._notes, most=_MOST_FRAMED)
+        textures = Textures(self._notes, most=_MOST_FRAMED)  # The studio's camera sees displaced surfaces
         heights = {shape: largest_height(shape, textures, self._notes) for shape in displaced}
         return self._surfaces.points(contents, heights)
 

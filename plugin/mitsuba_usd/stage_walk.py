@@ -27,8 +27,7 @@ from .stage_warnings import StageWarnings
 _FULL_MODES = (None, "default", "inherited")  # Values of model:drawMode without a proxy
 # Types of containers, and of prims that are read with others.
 _SILENT = ("", "Xform", "Scope", "Material", "Shader", "NodeGraph", "Camera", "GeomSubset", "SkelRoot", "Skeleton")
-# Types of prims of a camera rig.
-_OF_RIGS = ("", "Camera", "Scope", "Xform")
+_OF_RIGS = ("", "Camera", "Scope", "Xform")  # Types of prims of a camera rig
 _SINGULAR = "instances with singular transforms are ignored"
 
 
@@ -184,8 +183,7 @@ class _StageWalk:
 
     def _visible(self, root: Usd.Prim) -> Iterator[Usd.Prim]:
         """Visible prims of a subtree, without the descendants of instances and instancers in it."""
-        # The schema of instancers recommends prototypes below a class or an over.
-        prims = iter(_parts(root))
+        prims = iter(_parts(root))  # The schema of instancers recommends prototypes below a class or an over
         for prim in prims:
             imageable = UsdGeom.Imageable(prim)
             visibility = imageable and files.value_at(imageable.GetVisibilityAttr(), self._code)

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 UDIM = "<UDIM>"
 # Between texture coordinates of USD, whose v points up, and those of Mitsuba's bitmaps.
 V_DOWN = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])
-# File in an archive: archive.usdz[folder/file.png].
-_IN_ARCHIVE = re.compile(r"(.*\.usdz)\[(.*)\]$")
+_IN_ARCHIVE = re.compile(r"(.*\.usdz)\[(.*)\]$")  # File in an archive: archive.usdz[folder/file.png]
 _JPEG = b"\xff\xd8"
 _EXR = b"\x76\x2f\x31\x01"
 # Chromaticities of red, green, blue and white, and Mitsuba's tolerance for them.

@@ -19,8 +19,7 @@ from .materialx_nodes import Values, evaluate, fallback_of
 from .stage_warnings import StageWarnings
 from .texture_image import V_DOWN, TextureImage, is_srgb_image, linear_values, read_texture_image, with_alpha
 
-# Baked resolution without images, and with large tiled images.
-LEAST_PROCEDURAL, MOST = 1024, 4096
+LEAST_PROCEDURAL, MOST = 1024, 4096  # Baked resolution without images, and with large tiled images
 _PIXELS_AT_ONCE = 1 << 20
 _RAMPS = {"ramplr", "ramptb", "splitlr", "splittb"}
 Image = TextureContents | NodeContents

@@ -64,8 +64,7 @@ class CommandParser(argparse.ArgumentParser):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**{"formatter_class": _HelpFormatter, **options})
-        # Values such as -0.25:0.25 are not options.
-        self._negative_number_matcher = re.compile(r"^-\.?\d[\d.:]*$")
+        self._negative_number_matcher = re.compile(r"^-\.?\d[\d.:]*$")  # Values such as -0.25:0.25 are not options
 
     def error(self, message: str) -> NoReturn:
         self.print_usage(sys.stderr)
@@ -81,8 +80,7 @@ class _HelpFormatter(argparse.HelpFormatter):
     def add_argument(self, action: argparse.Action) -> None:
         super().add_argument(action)
         if isinstance(action, argparse._SubParsersAction):
-            # argparse does not count the indentation of commands.
-            self._action_max_length += self._indent_increment
+            self._action_max_length += self._indent_increment  # argparse does not count the indentation of commands
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         fill = super()._fill_text

@@ -136,8 +136,7 @@ def _render_picture(
             weigh_lights(loaded.scene, loaded.sensor_index)
             image = render_image(loaded, spp or loaded.sensor.sampler().sample_count(), seed)
             if options.denoise:
-                # Denoised separately, with the albedo and normals of its time.
-                image = denoised(loaded, image, seed)
+                image = denoised(loaded, image, seed)  # Denoised separately, with the albedo and normals of its time
         total = total + image / count
     channels = loaded.channel_names(total.shape[2])
     if source is None:

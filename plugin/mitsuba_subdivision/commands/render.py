@@ -215,8 +215,7 @@ def _require_effect(options: argparse.Namespace, is_model: bool) -> None:
     other = "a Mitsuba scene, which --save-scene writes" if is_model else "a model"
     for name in useless:
         given = getattr(options, name)
-        # Angles and sensors may be 0.
-        if given is not None and given is not False and given != []:
+        if given is not None and given is not False and given != []:  # Angles and sensors may be 0
             flags = {"parameters": "-D", "share": "--pass", "tolerances": "--tolerance", "aovs": "--aov"}
             flag = flags.get(name, f"--{name.replace('_', '-')}")
             raise ValueError(f'{flag} was given for the {what} "{options.scene}"; expected it for {other}')

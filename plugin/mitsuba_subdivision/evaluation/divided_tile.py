@@ -28,8 +28,7 @@ from .polynomials import polynomial_basis
 # depends on `Scheme.has_convex_rules`: without convex rules the bound of undivided parts is some ten times looser.
 # Curves along sides have few coefficients. Most flat tiles are flat by the fewer points of hulls after few divisions.
 DIVISIONS, DIVISIONS_OF_SIDES, FEW_DIVISIONS = {True: 8, False: 32}, 32, (1, 4)
-# Number of divisions before normals are bounded on the pieces.
-DIVISIONS_OF_NORMALS = 4
+DIVISIONS_OF_NORMALS = 4  # Number of divisions before normals are bounded on the pieces
 
 
 class DividedTile:
@@ -167,5 +166,4 @@ def part_of_tile(
     return _tile(element.scheme, element), stencils
 
 
-# A tile takes some 20 kB.
-_tile = lru_cache(maxsize=4096)(DividedTile)
+_tile = lru_cache(maxsize=4096)(DividedTile)  # A tile takes some 20 kB

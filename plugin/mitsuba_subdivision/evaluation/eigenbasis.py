@@ -14,16 +14,12 @@ from ..schemes.domain import FloatArray
 CLUSTER_WIDTH = 1e-6
 # Smallest singular value of a cluster's computed eigenvectors below which they are treated as dependent.
 DEPENDENT = 1e-3
-# A block that differs from a multiple of the identity by less than this is replaced by the multiple.
-DIAGONAL = 1e-11
-# Tolerance of the equations that define the basis.
-RESIDUAL = 1e-10
-# Number of steps of inverse iteration; each divides the error by about nine.
-INVERSE_ITERATIONS = 25
+DIAGONAL = 1e-11  # A block that differs from a multiple of the identity by less than this is replaced by the multiple
+RESIDUAL = 1e-10  # Tolerance of the equations that define the basis
+INVERSE_ITERATIONS = 25  # Number of steps of inverse iteration; each divides the error by about nine
 # The modulus of the second eigenvalue must be below one by more than this, or refinement does not converge.
 CONTRACTION = 1e-9
-# Power of the matrix with which `_require_basis` checks a basis.
-POWER = 20
+POWER = 20  # Power of the matrix with which `_require_basis` checks a basis
 
 
 class EigenbasisError(ArithmeticError):

@@ -156,8 +156,7 @@ def times_powers(
     real = rows.dtype.type
     kept = basis.moduli <= base * (1 + CLUSTER_WIDTH)
     ratios = np.where(kept, basis.eigenvalues / base, 0).astype(real)
-    # Powers are computed once for each level that occurs.
-    occurring, which = distinct_levels(level)
+    occurring, which = distinct_levels(level)  # Powers are computed once for each level that occurs
     powers: NDArray = ratios ** occurring.astype(real)[:, None]
     scaled = rows * powers.take(which, axis=0)
     scaled[:, :, ~kept] = 0

@@ -38,8 +38,7 @@ GROWING_LEVELS = 16
 # Default number of levels of a tip that are stored as pieces. Their normals need no frames: derivatives become more
 # parallel at each level, but at these single precision keeps enough bits of their cross product.
 PIECE_LEVELS = 3
-# Number of regular children of a tip at each level.
-LEVEL_PIECES = 3
+LEVEL_PIECES = 3  # Number of regular children of a tip at each level
 # Distance from the extraordinary point, in parameters and in sizes of the patch, that single precision cannot resolve.
 FLOAT32_SIZE = 2.0**-24
 

@@ -34,10 +34,8 @@ from .polynomials import polynomial_basis
 # eigen-coordinates, whose large terms may cancel and leave rounding errors. Times `TANGENT_ROUNDING`, this share is at
 # least one rounding error.
 CANCELLED = 1 / 16
-# A piece with fewer samples than this is replaced by a plane for each sample.
-FEW_SAMPLES = 4
-# Exponents of the monomials of a plane.
-PLANE_POWERS = np.array([(0, 0), (1, 0), (0, 1)])
+FEW_SAMPLES = 4  # A piece with fewer samples than this is replaced by a plane for each sample
+PLANE_POWERS = np.array([(0, 0), (1, 0), (0, 1)])  # Exponents of the monomials of a plane
 
 
 # A node of the patch trees with samples: its tree; its number of samples, which are in increasing order at depth 0, and
@@ -64,8 +62,7 @@ class LocatedSamples:
         scheme: Scheme,
         elements: Sequence[PatchTree],  # All different
         element: IntArray,  # (s,) int64: index of each sample's element, in increasing order
-        # (s, 2) float64: parameters with (0, 0) at the sample's corner, so that they are exact near it
-        uv: FloatArray,
+        uv: FloatArray,  # (s, 2) float64: parameters with (0, 0) at the sample's corner, so that they are exact near it
         corner: IntArray,  # (s,) int64: corner of the element at which (u, v) is (0, 0)
     ) -> None:
         self.scheme, self._given = scheme, (elements, element, uv, corner)
@@ -73,8 +70,7 @@ class LocatedSamples:
         # significant digit is the child of the element. Two samples of an element lie in the same leaf if these are
         # equal.
         self.path = np.zeros(len(uv), dtype=np.int64)
-        # Number of each sample, counted through all `leaves`
-        self.leaf_sample = np.zeros(len(uv), dtype=np.int64)
+        self.leaf_sample = np.zeros(len(uv), dtype=np.int64)  # Number of each sample, counted through all `leaves`
         self._depths: list[list[Node]] = []
         domain, uv, speed, leaf_turn = scheme.domain, uv.copy(), np.ones(len(uv)), corner.copy()
         in_leaves: dict[IrregularPatch | None, list[tuple[int, int, Piece, IntArray]]] = {}
@@ -264,8 +260,7 @@ def sampled_polynomials(
     located = LocatedSamples(scheme, elements, element, np.concatenate(uv), 0 * element)
     numbers, parameters = zip(*(_in_pieces(scheme, leaves) for leaves in located.leaves), strict=True)
     number, st = located.per_sample(numbers), located.per_sample(parameters).T
-    # Sorted so that the samples of a piece are consecutive.
-    order = np.lexsort((number, located.path, element))
+    order = np.lexsort((number, located.path, element))  # Sorted so that the samples of a piece are consecutive
     keys = np.stack([element, located.path, number])[:, order]
     begins = np.flatnonzero((np.diff(keys, axis=1, prepend=-2) != 0).any(axis=0))
     counts = np.diff(begins, append=len(order))

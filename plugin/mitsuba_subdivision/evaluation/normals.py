@@ -31,8 +31,7 @@ LEAST_LENGTH = {32: 2.0**-126, 64: 2.0**-1022}
 # An eigenvector belongs to the border curve if the weight of an inner vertex, relative to the largest, is not above
 # this.
 INSIDE = 1e-6
-# Bound of the rounding error of sines of multiples of pi.
-ROUNDED = 1e-14
+ROUNDED = 1e-14  # Bound of the rounding error of sines of multiples of pi
 
 
 def unit_normals(
@@ -92,8 +91,7 @@ def limit_frame(scheme: Scheme, signature: Signature, basis: Eigenbasis) -> Floa
         return _tip_weights(len(edges), 2 * np.pi / fan.face_count) @ edges
     if fan.rule == VertexRule.CORNER:
         if fan.face_count < border_faces:
-            # The two edges span the tangent plane.
-            return edges[[0, -1]]
+            return edges[[0, -1]]  # The two edges span the tangent plane
         # At a wide corner the surface is the tip of a cone.
         return _tip_weights(len(edges), min(2 * np.pi / fan.face_count, np.pi / border_faces)) @ edges
     inward = _across_lone_face(ring, basis) if fan.face_count == 1 else _inward(basis, neighbours[1])

@@ -31,8 +31,7 @@ from .irregular_patch import IrregularPatch
 
 # Number of control points of the one-rings that are refined together, which bounds memory to tens of megabytes.
 JOINED_CONTROLS = 1 << 14
-# Tolerance when comparing the sum of a stencil's weights with 1.
-ROW_SUM = 1e-12
+ROW_SUM = 1e-12  # Tolerance when comparing the sum of a stencil's weights with 1
 # Maximum depth of a patch tree. Each refinement reduces the sharpness of semi-sharp features, below `INFINITE`, by one.
 # Without them, the schemes of this package need one or two refinements until all elements are pieces. A scheme
 # that needs more than six is refused: its rules keep making new extraordinary points.
@@ -61,8 +60,7 @@ class PatchTree:
         """The whole element as one piece: a regular patch, or self-similar at one of its corners. None for others."""
         scheme, signature = self.scheme, self.signature
         if signature.is_semi_sharp:
-            # Not self-similar: each refinement reduces the sharpness.
-            return None
+            return None  # Not self-similar: each refinement reduces the sharpness
         lattice = lattice_stencils(scheme, signature)
         if lattice is not None:
             return Piece(IDENTITY, lattice, None)
@@ -256,8 +254,7 @@ def refined_children(scheme: Scheme, signatures: Sequence[Signature]) -> list[li
     offsets = ragged.offsets(np.diff(first_vertices)[parent_of_row])
     rows, columns, weights = table.entries(controls)
     error = np.abs(np.bincount(rows, weights, minlength=len(parent_of_row)) - 1)
-    # `not <=` also refuses NaN.
-    if not error.max() <= ROW_SUM:
+    if not error.max() <= ROW_SUM:  # `not <=` also refuses NaN
         worst = int(np.argmax(error))
         smooth, total = signatures[parent_of_row[worst]].smoothed, weights[rows == worst].sum()
         raise SchemeError(

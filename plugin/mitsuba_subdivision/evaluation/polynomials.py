@@ -24,8 +24,7 @@ NO_COEFFICIENT = 1e-6
 # singular value is 10^-7 of the largest. NumPy's default is not used, as NumPy 2.2 computes it from `numpy.finfo`,
 # which warns in Mitsuba's threads because they flush denormal numbers to zero.
 INDEPENDENT = 1e-13
-# Tolerance when comparing the polynomials with the scheme's `regular_basis`.
-ROUNDED = 1e-11
+ROUNDED = 1e-11  # Tolerance when comparing the polynomials with the scheme's `regular_basis`
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,8 +23,7 @@ from .patch_tree import (
 
 # Valences, and numbers of corners, with which a scheme is tested if it supports them.
 VALENCES, SIZES = range(3, 9), (3, 4, 5)
-# Tolerance when comparing weights.
-SAME_WEIGHTS = 1e-12
+SAME_WEIGHTS = 1e-12  # Tolerance when comparing weights
 # Step of the central differences that derivatives are compared with, and tolerance of the comparison, relative to the
 # largest derivative. The error of central differences is proportional to the square of the step.
 STEP, SAME_SLOPE = 1e-4, 1e-5
@@ -58,8 +57,7 @@ def check_scheme(scheme: Scheme) -> None:
         LocatedSamples(scheme, [patch_tree(scheme, signature)], np.zeros(1, int), inside, np.zeros(1, int))
         patch = irregular_patch(scheme, signature)
         if patch is not None:
-            # Raises an error if there is no eigenbasis.
-            _ = patch.basis
+            _ = patch.basis  # Raises an error if there is no eigenbasis
     if scheme.has_phantom_points and scheme.has_local_borders:
         _check_local_borders(scheme)
 

@@ -217,11 +217,9 @@ def _draw_panel(axis: Axes, cages: list[ControlCage], offset: float) -> list[tup
 def offset_cage(cage: ControlCage, offset: float, scheme: str | None = None, dtype: Any = np.float32) -> ControlCage:
     """A cage, moved until the limit point of vertex 0 has this distance from the origin, and rounded."""
     limit = LimitSurface(cage, scheme).evaluate(0, [[0.0, 0.0]]).p[0]
-    # A direction along no axis, neither normal nor tangential to the surface.
-    direction = np.array([0.48, 0.6, 0.64])
+    direction = np.array([0.48, 0.6, 0.64])  # A direction along no axis, neither normal nor tangential to the surface
     moved = cage.positions - limit + offset * direction
-    # All evaluators start from the same numbers.
-    return cage.with_positions(moved.astype(dtype).astype(np.float64))
+    return cage.with_positions(moved.astype(dtype).astype(np.float64))  # All evaluators start from the same numbers
 
 
 def normal_errors(cage: ControlCage, exact: FloatArray, evaluator: Evaluator, dtype: Any) -> FloatArray:

@@ -23,8 +23,7 @@ from .output import FigureError
 
 # Header of an array: name, type and number of values.
 _HEADER = np.dtype([("name", "S16"), ("type", "S8"), ("size", "<i8")])
-# Environment variable for the folder of programs that are not on the path.
-VARIABLE = "MITSUBA_SUBDIVISION_PEERS"
+VARIABLE = "MITSUBA_SUBDIVISION_PEERS"  # Environment variable for the folder of programs that are not on the path
 BLENDER_SCRIPT = Path(__file__).with_name("blender_script.py")
 
 
@@ -91,8 +90,7 @@ def _answer(program: Path, before: list[str], query: bytes, after: list[str]) ->
         queries, answers = Path(folder, "queries"), Path(folder, "answers")
         queries.write_bytes(query)
         done = subprocess.run([program, *before, queries, answers, *after], capture_output=True, text=True, check=False)
-        # Blender may exit with 0 although its script failed.
-        if done.returncode or not answers.exists():
+        if done.returncode or not answers.exists():  # Blender may exit with 0 although its script failed
             raise FigureError(f"{program} fails: {done.stderr.strip() or done.returncode}")
         return answers.read_bytes()
 

@@ -21,8 +21,7 @@ from .output import FigureOptions, panels, write_figure
 from .staging import draw_picture, load_stage, picture_size, render, render_panels, staged
 
 SCHEMES = {"catmull_clark": "Catmull-Clark", "doo_sabin": "Doo-Sabin", "loop": "Loop"}
-# Kinds of shading, and segments per edge.
-SHADINGS = (("vertex", 2), ("vertex", 8), ("exact", 2))
+SHADINGS = (("vertex", 2), ("vertex", 8), ("exact", 2))  # Kinds of shading, and segments per edge
 SHADING_TITLES = {"vertex": "normals of vertices", "exact": "exact at every hit"}
 
 
@@ -64,8 +63,7 @@ AROUND, UP, LOWEST, HIGHEST = 12, 10, 0.10, 0.70
 # jump at its texels, which is visible along grooves that are two texels wide: these are eight wide.
 BEAD, FADE, SOFT = 0.21, 0.5, 0.1
 GLAZE, LINES = (0.009, 0.105, 0.10), (0.42, 0.58, 0.52)
-# Width of lines relative to triangles' heights, and side of their image.
-LINE, LINE_IMAGE = 0.045, 256
+LINE, LINE_IMAGE = 0.045, 256  # Width of lines relative to triangles' heights, and side of their image
 
 
 def draw_displacement(options: FigureOptions) -> list[Path]:
@@ -96,8 +94,7 @@ def quilt() -> NDArray[np.float32]:
     """Image of heights up to 1 that repeats sideways: cushions between grooves, with a bead at each crossing."""
     x, y = np.meshgrid((np.arange(COLUMNS) + 0.5) / COLUMNS, (np.arange(ROWS) + 0.5) / ROWS)
     part = (y - LOWEST) / (HIGHEST - LOWEST)
-    # Grooves lie where one of these is an integer.
-    p, q = x * AROUND + part * UP / 2, x * AROUND - part * UP / 2
+    p, q = x * AROUND + part * UP / 2, x * AROUND - part * UP / 2  # Grooves lie where one of these is an integer
     cushion = np.sqrt((np.sin(np.pi * p) * np.sin(np.pi * q)) ** 2 + SOFT**2) - SOFT
     away = np.hypot((p + 0.5) % 1 - 0.5, (q + 0.5) % 1 - 0.5) / BEAD
     bead = 0.6 * np.where(away < 1, 1 + np.cos(np.pi * np.minimum(away, 1)), 0) / 2

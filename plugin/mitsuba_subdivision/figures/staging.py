@@ -22,15 +22,12 @@ from ..surface import LimitSurface
 from ..variants import SceneNode
 from .output import FigureError, FigureOptions, panels, show, write_figure
 
-# Samples of one part, which determine a render's memory and its steps of progress.
-PART_SAMPLES = 1 << 26
+PART_SAMPLES = 1 << 26  # Samples of one part, which determine a render's memory and its steps of progress
 # A single picture is wider than panels of a figure by this factor, with an aspect of 8 : 5.
 WIDER, HEIGHT = 2.25, 0.625
-# Offset of points from their surface for visibility tests, relative to the camera's distance.
-LIFT = 2e-3
+LIFT = 2e-3  # Offset of points from their surface for visibility tests, relative to the camera's distance
 REFINEMENTS = 2  # Enough to isolate every extraordinary vertex
-# Distance from the vertex beyond which faces are holes, relative to the shortest edge there.
-FAR = 4
+FAR = 4  # Distance from the vertex beyond which faces are holes, relative to the shortest edge there
 # Sizes of a cage before a camera, the largest first, and margin at each side of the picture.
 SCALES, MARGIN = np.geomspace(4, 0.4, 100), 0.04
 SMALLEST = 1e-300  # Size of a cage of equal points
@@ -120,8 +117,7 @@ def edge_rods(
 ) -> SceneNode:
     """Rods along edges of a cage, given by their ends ``(n, 2)``, with joints there; by colours in sRGB and radii."""
     shapes: SceneNode = {}
-    # The sharpest edge comes last, so that a vertex keeps its joint.
-    for edge in np.argsort(sharpness, kind="stable"):
+    for edge in np.argsort(sharpness, kind="stable"):  # The sharpest edge comes last, so that a vertex keeps its joint
         colour, radius = looks[edge]
         rod = {"radius": radius, "bsdf": paint(colour)}
         p0, p1 = cage.positions[edges[edge]].tolist()

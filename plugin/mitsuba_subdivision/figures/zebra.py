@@ -31,11 +31,9 @@ DARK, LIGHT = 0.015, 0.92
 # Fields of view of the close-up, and of the overview of the whole surface.
 FIELD_OF_VIEW, WIDE_FIELD_OF_VIEW = 5.2, 16.5
 WIDE_STRIPES = 28
-# Face of `cube`, and its corner, in the close-up.
-CORNER_FACE, CORNER = 1, 2
+CORNER_FACE, CORNER = 1, 2  # Face of `cube`, and its corner, in the close-up
 NORMAL_RAYS = 5
-# OpenSubdiv's own default for surfaces of single faces (Bfr).
-OPENSUBDIV_LEVEL = 2
+OPENSUBDIV_LEVEL = 2  # OpenSubdiv's own default for surfaces of single faces (Bfr)
 MIRROR = {"type": "conductor", "material": "none"}
 # Colours in sRGB: of bands in the wrong place, and of the rings around the corner.
 WRONG = np.array([240, 90, 30])

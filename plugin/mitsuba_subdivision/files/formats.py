@@ -28,8 +28,7 @@ class Format:
     Functions are named "module:function"; the module of this package is imported on first use.
     """
 
-    # Reads `CageContents` from a path; if the format has prims, with arguments of `ControlCage.from_file`.
-    read: str
+    read: str  # Reads `CageContents` from a path; if the format has prims, with arguments of `ControlCage.from_file`
     write: str = ""  # Takes `CageContents` and a path; empty if there is none
     write_triangles: str = ""  # Takes a path and `Triangles`; empty if there is none
     _: KW_ONLY

@@ -301,8 +301,7 @@ class _ObjText:
                 raise CageError(f"{name}, line {line}: the file ends in a line continuation; expected another line")
             text = re.sub(rb"\\\r?\n", lambda match: b" " * len(match[0]), text)
             statement_end = np.flatnonzero(np.frombuffer(text, np.uint8) == _NEWLINE)
-        # Two more bytes, so that every statement can be compared with a keyword of two letters.
-        text += b"\n\n"
+        text += b"\n\n"  # Two more bytes, so that every statement can be compared with a keyword of two letters
 
         token_start = _run_starts(np.frombuffer(text, np.uint8) > _SPACE)
         first_token = np.append(0, np.searchsorted(token_start, statement_end))

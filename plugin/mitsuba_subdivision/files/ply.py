@@ -35,8 +35,7 @@ _TEXCOORDS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 _MATERIAL = ("material_index", "material_id", "texnumber")
 _RESERVED = {*_POSITION, *_NORMAL, *chain(*_COLORS, *_TEXCOORDS)} - {"alpha"}
 _NUMBER = "0|[1-9][0-9]{0,8}"
-# Endings of the three columns of an attribute, and the addition to its name.
-_LETTERS = {"xyz": "", "rgb": "_color"}
+_LETTERS = {"xyz": "", "rgb": "_color"}  # Endings of the three columns of an attribute, and the addition to its name
 _TYPES = {np.dtype("<f8"): "double", np.dtype("<f4"): "float", np.dtype("<i4"): "int", np.dtype("u1"): "uchar"}
 
 
@@ -53,8 +52,7 @@ def read_ply(path: str | Path) -> CageContents:
     lines: dict[str, IntArray] = {}
     first = 2 + len(header.splitlines())
     for word, digits in re.findall(rb"[\r\n]element\s+(\S+)\s+(\d+)", header):
-        # Plyfile allocates as many rows as the header states.
-        if len(digits) > 18 or int(digits) > len(content):
+        if len(digits) > 18 or int(digits) > len(content):  # Plyfile allocates as many rows as the header states
             rows = shortened(f"{digits.decode()} rows of {word.decode('ascii', 'replace')}", 200)
             raise CageError(f"{name}: {rows} do not fit into the file; expected fewer")
         if not binary:
@@ -91,8 +89,7 @@ def _elements(content: bytes, name: str, lines: dict[str, IntArray], binary: boo
             return PlyData.read(io.BytesIO(content), mmap=False)
         except UnicodeDecodeError:
             raise CageError(f"{name}: there are bytes that are not ASCII; expected an ASCII PLY file") from None
-        # For damaged files, plyfile raises its own errors, Python's and NumPy's.
-        except Exception as error:
+        except Exception as error:  # For damaged files, plyfile raises its own errors, Python's and NumPy's
             cut = " (is the file cut short?)" if "early end" in str(error) else ""
             row, element, line = (getattr(error, attribute, None) for attribute in ("row", "element", "line"))
             if element is not None and row is not None and element.name in lines:

@@ -29,12 +29,10 @@ RULE_ATTRIBUTES = {
 SCHEMES = {"catmullClark": "catmull_clark", "loop": "loop"}
 FLAT_SCHEMES = ("none", "bilinear")
 INTERPOLATIONS: dict[str, Interpolation] = {"vertex": "vertex", "varying": "varying", "faceVarying": "face_varying"}
-# Names of primvars for texture coordinates; the first is written.
-TEXCOORDS = ("st", "UVMap", "texcoords")
+TEXCOORDS = ("st", "UVMap", "texcoords")  # Names of primvars for texture coordinates; the first is written
 HIDDEN_PURPOSES = ("guide", "proxy")  # Values of purpose that renderers do not show
 ALL = "*"  # Value of `prim` that selects every mesh in the file
-# Characters of USD's messages to show, and to search for a reason.
-_MOST_SHOWN, _MOST_SEARCHED = 200, 10_000
+_MOST_SHOWN, _MOST_SEARCHED = 200, 10_000  # Characters of USD's messages to show, and to search for a reason
 _MATERIALX = re.compile(r"Could not open asset @([^@]*\.mtlx)[@:]", re.IGNORECASE)
 
 

@@ -27,15 +27,13 @@ from .unknown_creases import UnknownCreases
 # Names in the scene of the fitted shape and its control points, and prefix of its attributes.
 SHAPE = "surface"
 CONTROL_POINTS, CAGE_VALUES = f"{SHAPE}.control_points", f"{SHAPE}.cage_"
-# Variables of the optimiser: coordinates of control points, and sharpness of creases.
-U, SHARPNESS = "u", "sharpness"
+U, SHARPNESS = "u", "sharpness"  # Variables of the optimiser: coordinates of control points, and sharpness of creases
 # Moving outlines need a projective integrator. Few scenes need gradients of shadows.
 DEFAULT_INTEGRATOR = {"type": "direct_projective", "sppi": 0}
 DEFAULT_SHAPE = {"tessellation_rate": 4}
 
 Loss = Literal["l1", "l2"] | Callable[["mi.TensorXf", int], "mi.TensorXf"]
-# Size relative to the initial surface at which triangles have no area in single precision.
-COLLAPSED = 1e-4
+COLLAPSED = 1e-4  # Size relative to the initial surface at which triangles have no area in single precision
 # Number of control points, of a cube refined twice, from which λ has its full value. Fewer control points have a smooth
 # surface, and λ would only slow opposed motions of neighbours.
 MANY_POINTS = 98
@@ -212,8 +210,7 @@ class CageFit(Fit):
         creases = self._creases
         cage, halvings = start.cage, 0
         if creases is not None:
-            # Each refinement halves the segments of edges.
-            cage, halvings = creases.refined, creases.highest
+            cage, halvings = creases.refined, creases.highest  # Each refinement halves the segments of edges
             self._others[SHARPNESS] = upload(mi.Float, creases.initial)
         rate = max(1, self._shape["tessellation_rate"] >> halvings)
         shape = {"type": "subdivision", **cage.as_properties(mi), **self._shape, "tessellation_rate": rate}

@@ -29,8 +29,7 @@ STEPS_OF_MEAN, LEAST_FALL = 10, 0.02
 FORMAT = 2  # Version of checkpoints; their coordinates of control points depend on λ of large steps
 
 State = Mapping[str, NDArray]  # State of a fit: arrays by name, "variable: field"
-# A number, or a schedule of users.
-Schedulable = float | Sequence[tuple[float, float]] | Callable[[int], float]
+Schedulable = float | Sequence[tuple[float, float]] | Callable[[int], float]  # A number, or a schedule of users
 
 
 class Fit(ABC):

@@ -21,8 +21,7 @@ from .fitting import Fit, Schedulable, Schedule, State
 from .smoothness import quadratic_form
 
 POINTS = "points: value"  # Name in checkpoints
-# Distance beyond which a part of the surface has no points nearby, in median distances between points.
-NEAR = 5.0
+NEAR = 5.0  # Distance beyond which a part of the surface has no points nearby, in median distances between points
 DAMPING = 1e-8  # Weight of the current position of each control point, relative to the mean weight of points
 POINTS_PER_CONTROL_POINT = 8  # Default number of points on the mesh for each final control point
 

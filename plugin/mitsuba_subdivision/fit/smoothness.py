@@ -129,8 +129,7 @@ def regularizer(name: str, start: LimitSurface) -> Callable[[dr.ArrayBase], mi.F
 
     def energy(points: dr.ArrayBase) -> mi.Float:
         away = points - origin
-        # The product is the derivative of the form.
-        product = matrix.product(dr.detach(away))
+        product = matrix.product(dr.detach(away))  # The product is the derivative of the form
         return dr.dot(away, product) - dr.dot(dr.detach(away), product) / 2
 
     return energy

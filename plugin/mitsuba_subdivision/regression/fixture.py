@@ -169,8 +169,7 @@ class RenderRegression:
         relative = Path(os.path.relpath(scene, self.node.config.rootpath)).parent
         folder = self.references.joinpath(*(part for part in relative.parts if part not in ("..", os.sep)))
         path, old = folder / f"{scene.stem}{_suffix(settings)}.exr", self.references / f"{scene.stem}.exr"
-        # Older versions named references by the scene's file only.
-        if not path.exists() and old.is_file():
+        if not path.exists() and old.is_file():  # Older versions named references by the scene's file only
             with suppress(RegressionError):
                 made_of = load_image(old).metadata
                 if _settings_of(made_of) == settings and _scene_of(made_of, old) in (None, scene.resolve()):

@@ -84,8 +84,7 @@ def combine(estimates: Iterable[Estimate]) -> Estimate:
         count = total.count + estimate.count
         share = (estimate.count / count)[..., None]
         batches = total.batches + estimate.batches
-        # `Image.not_finite` reports values that are not finite.
-        with np.errstate(invalid="ignore", over="ignore"):
+        with np.errstate(invalid="ignore", over="ignore"):  # `Image.not_finite` reports values that are not finite
             step = estimate.mean - total.mean
             squares_within = estimate.variance * max(estimate.batches - 1, 0)
             squares = squares + squares_within + step**2 * share * total.count[..., None]

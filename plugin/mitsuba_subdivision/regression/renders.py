@@ -28,8 +28,7 @@ from .scene import SEEDS, LoadedScene, SceneSource, load_scene, render_pixels
 from .tiers import Status, Tolerances
 
 BATCH = 64  # Samples per pixel of a batch
-# Fewer batches estimate the variance badly.
-LEAST_BATCHES = 4
+LEAST_BATCHES = 4  # Fewer batches estimate the variance badly
 _OF_SAMPLING = ("seed", "batch", "total")
 # Entries of the metadata that all passes of an image share.
 _SHARED = ("variant", "filter", "sampler", "sensor", "size", "channels", "files", "parameters", *_OF_SAMPLING)
@@ -86,9 +85,8 @@ def render_pass(
             first = pixels if first is None else first
             yield Estimate.of_batch(pixels, sampling.batch)
 
-    # Rounded as in a file, so that a pass is the same after writing and reading.
     with timed("Rendering") as at:
-        estimate = combine(batches()).stored()
+        estimate = combine(batches()).stored()  # Rounded, so that a pass is the same after writing and reading
     record = {"seed": sampling.seed, "batch": sampling.batch, "batches": [[share.start, share.stop]]}
     metadata: dict[str, Any] = {
         "version": __version__,
@@ -181,8 +179,7 @@ def probe_scene(loaded: LoadedScene) -> Probe:
         return scene.ray_intersect(ray)
 
     shapes = scene.shapes()
-    # One hit with arrays; in scalar variants, one for each pixel.
-    if dr.is_jit_v(mi.Float):
+    if dr.is_jit_v(mi.Float):  # One hit with arrays; in scalar variants, one for each pixel
         pixel = dr.arange(mi.UInt32, width * height)
         hits = [first_hit(mi.Float(pixel % width), mi.Float(pixel // width))]
         dr.eval(hits)
@@ -211,8 +208,7 @@ def probe_scene(loaded: LoadedScene) -> Probe:
 # Samples per pixel: four batches for a test, and 64 times as many for a reference.
 TEST_SPP = 256
 REFERENCE_SPP = 16384
-# Distance between the seeds of references, tests and second attempts, whose samples differ.
-SEED_STEP = 2**20
+SEED_STEP = 2**20  # Distance between the seeds of references, tests and second attempts, whose samples differ
 RETRY_FACTOR = 4  # Samples of the second attempt, relative to the first
 
 

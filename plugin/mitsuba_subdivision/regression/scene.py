@@ -131,8 +131,7 @@ def _parsed_scene(
             mi.parser.transform_all(config, state)
             made = mi.parser.instantiate(config, state)
         finally:
-            # Rendering another scene crashes while the traceback of an error keeps a half-made scene alive.
-            del state
+            del state  # Rendering another scene crashes while the traceback of an error keeps a half-made scene alive
     # A single object comes in a list.
     return (made[0] if isinstance(made, (list, tuple)) and len(made) == 1 else made), files
 
@@ -161,8 +160,7 @@ def _replace_filter(state: mi.parser.ParserState, name: str) -> None:
         node = mi.parser.SceneNode()
         node.type = mi.ObjectType.ReconstructionFilter
         node.props = mi.Properties(name)
-        # A new node moves the others in memory, so the film is looked up afterwards.
-        state.nodes.append(node)
+        state.nodes.append(node)  # A new node moves the others in memory, so the film is looked up afterwards
         properties = state.nodes[film].props
         for key in list(properties.keys()):
             if properties.type(key) == mi.Properties.Type.ResolvedReference and properties[key].index() in filters:

@@ -26,18 +26,15 @@ TIERS = {
 # Noise increases FLIP's errors, so this tier is only for images that no other tier can compare.
 DEFAULT_TIERS = ("probe", "paired", "tile")
 
-# Differences are relative to at least this part of the image's mean.
-DARK = 1e-3
+DARK = 1e-3  # Differences are relative to at least this part of the image's mean
 # Both images have the same samples if these agree. References of older versions lack the last two.
 _SAME_SAMPLES, _IF_KNOWN = ("variant", "filter", "paired"), ("sampler", "sensor")
 
 # Sides of the square tiles in pixels; None for the whole image. Small tiles find dents, large ones changes of colour.
 SCALES: tuple[int | None, ...] = (4, 8, 16, None)
-# Recommended samples of a reference per sample of the test, for negligible noise.
-REFERENCE_SAMPLES = 16
+REFERENCE_SAMPLES = 16  # Recommended samples of a reference per sample of the test, for negligible noise
 NOISE_TILE = 4  # Side of the tiles for the ratio of the test's noise to the reference's
-# Error of Mitsuba's spectra of a colour, relative to its largest value; measured for 18 colours.
-SPECTRA = 5e-4
+SPECTRA = 5e-4  # Error of Mitsuba's spectra of a colour, relative to its largest value; measured for 18 colours
 # Least part of the variance for images with all samples in common. If a single bright path makes all noise of a pixel,
 # and rounding changes this path, the difference is 1 / sqrt(0.1) = 3.2 standard errors.
 LEAST_NOISE = 0.1
@@ -46,8 +43,7 @@ _MOST_FREEDOM = 1e12  # More degrees of freedom make no difference
 # Value that FLIP's tone curve, ACES, maps to 0.85, which limits its exposures; and weights of R, G and B.
 _BRIGHT = 2.118872324
 _LUMINANCE = (0.2126, 0.7152, 0.0722)
-# Most stops between the brightest and the median pixel: more take time and show nothing new.
-_MOST_STOPS = 12
+_MOST_STOPS = 12  # Most stops between the brightest and the median pixel: more take time and show nothing new
 
 
 class Status(Enum):
@@ -80,8 +76,7 @@ class Tolerances:
     thousandth in one weight of a refinement rule (0.009 degrees, 1.2e-5 diagonals).
     """
 
-    # Share of pixels that may show another shape or element, or a hit in one image only
-    mask_fraction: float = 1e-3
+    mask_fraction: float = 1e-3  # Share of pixels that may show another shape or element, or a hit in one image only
     # Degrees between shading normals away from silhouettes: 99.9th percentile and maximum
     angle_p999: float = 0.002
     angle_max: float = 0.01
@@ -262,8 +257,7 @@ def _different_samples(reference: Image, test: Image) -> str | None:
     keys = [*_SAME_SAMPLES, *(key for key in _IF_KNOWN if key in reference.metadata and key in test.metadata)]
     wanted, given = ({key: image.metadata.get(key) for key in keys} for image in (reference, test))
     for described in (wanted, given):
-        # Older references also contain the sampler's numbers of samples.
-        if sampler := described.get("sampler"):
+        if sampler := described.get("sampler"):  # Older references also contain the sampler's numbers of samples
             described["sampler"] = without_sample_counts(sampler)
     if different := _differences(wanted, given):
         return f"the samples are not the same: {'; '.join(different)}"

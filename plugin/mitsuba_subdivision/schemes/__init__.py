@@ -31,7 +31,6 @@ __all__ = [
     "with_rules",
 ]
 
-# Names of the schemes of this package.
-BUILT_IN = tuple(kind.name for kind in (CatmullClark, DooSabin, Loop))
+BUILT_IN = tuple(kind.name for kind in (CatmullClark, DooSabin, Loop))  # Names of the schemes of this package
 for _kind in (CatmullClark, DooSabin, Loop):
     register_scheme(_kind())

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from ..mesh.connectivity import CreaseMethod, IntArray, SemiSharpness, Topology, VertexRule
 from .domain import FloatArray
 
-# Weight of each of the two neighbours in the crease mask.
-CREASE_NEIGHBOUR = 1 / 8
+CREASE_NEIGHBOUR = 1 / 8  # Weight of each of the two neighbours in the crease mask
 
 
 def crease_masks(

@@ -151,8 +151,7 @@ class ParameterDomain:
         u, v = (grid.ravel() for grid in np.meshgrid(nodes, nodes))
         products = np.outer(weights, weights).ravel()
         if self._is_triangle:
-            # The rule of the square, with one side collapsed to a point.
-            v, products = v * (1 - u), products * (1 - u)
+            v, products = v * (1 - u), products * (1 - u)  # The rule of the square, with one side collapsed to a point
         return np.stack([u, v], axis=1), products
 
 

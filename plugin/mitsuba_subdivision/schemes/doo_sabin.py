@@ -28,8 +28,7 @@ class DooSabin(Scheme):
     # The corners of the domain are the centres of the faces around the vertex; that of the first face is (0, 0).
     first_edge = np.array([(0.5, 0.5), (-0.5, 0.5)])
     edge_turn = np.array([(0, -1), (1, 0)], dtype=float)
-    # A border vertex has no patch, so no patch has control points beyond a border.
-    phantom_points = ()
+    phantom_points = ()  # A border vertex has no patch, so no patch has control points beyond a border
 
     def unsupported(self, topology: Topology) -> Unsupported | None:
         """Return vertices of a valence below 3, which would become faces with two corners."""
@@ -79,8 +78,7 @@ class DooSabin(Scheme):
             return [(IDENTITY, half_edge)]
         parts = []
         for k, child in enumerate(self.domain.children):
-            # The refined half-edge inside the coarse face; the child's (0, 0) is k faces before it.
-            start = fan[k]
+            start = fan[k]  # The refined half-edge inside the coarse face; the child's (0, 0) is k faces before it
             for _ in range((4 - k) % 4):
                 start = int(refined.turn[start])
             parts.append((child, start))

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 
 _SCHEMES: dict[str, Scheme] = {}
 
-# How Catmull-Clark refines triangles.
-TriangleRule = Literal["catmull_clark", "smooth"]
+TriangleRule = Literal["catmull_clark", "smooth"]  # How Catmull-Clark refines triangles
 
 
 class SchemeError(ValueError):

@@ -31,8 +31,7 @@ from .studio_entries import DEFAULT_SIZE, DEFAULT_SPP, DEFAULT_VIEW, Look, View,
 CLAY = (0.56, 0.52, 0.47)
 CHECKER = (0.15, 0.23, 0.32), (0.72, 0.68, 0.61)
 CHECKER_SQUARES = 16  # Squares along a texture coordinate from 0 to 1
-# Attributes that replace the colour of clay: of PLY files, and of USD's meshes.
-COLOURS = ("color", "displayColor")
+COLOURS = ("color", "displayColor")  # Attributes that replace the colour of clay: of PLY files, and of USD's meshes
 WIRE_COLOUR, WIRE_RATE = (0.015, 0.05, 0.12), 2
 # Radius of rods relative to the model's, its maximum relative to the median edge; radius of balls relative to rods.
 ROD, ROD_PER_EDGE, BALL = 0.0045, 0.05, 2.2

@@ -28,8 +28,7 @@ _OPTIONS = {
 # Options without effect on colours: strength of bumps, sharpness and size of mipmaps.
 _OPTIONS_WITHOUT_EFFECT = ("-bm", "-boost", "-cc", "-texres")
 _EXPECTED = "Kd, map_Kd (with -s, -o, -mm, -clamp, -blendu and -blendv), Ks, Ns, Ke, d, Tr, illum, Pr and Pm"
-# Numbers of entries, and the texture of ``map_Kd``.
-Material = dict[str, list[float] | SceneNode]
+Material = dict[str, list[float] | SceneNode]  # Numbers of entries, and the texture of ``map_Kd``
 
 
 def read_materials(path: Path) -> dict[str, Material]:
@@ -75,8 +74,7 @@ def _parsed(library: Path, text: str) -> dict[str, Material]:
             materials[rest] = material = {}
         elif key in _NUMBERS:
             values = _leading_numbers(rest.split(), _NUMBERS[key])
-            # One number is a grey.
-            values = values * 3 if len(values) == 1 and _NUMBERS[key] == 3 else values
+            values = values * 3 if len(values) == 1 and _NUMBERS[key] == 3 else values  # One number is a grey
             if len(values) == _NUMBERS[key]:
                 material.setdefault(key, values)
             else:

@@ -24,8 +24,7 @@ from .studio_entries import variant_in_use
 ERRORS = {"exact": 0.1, "vertex": 0.5 / 4**2}
 # Quantile of vertices for the estimated error: it overestimates borders and creases, and few vertices are at outlines.
 MOST_VERTICES = {"exact": 0.95, "vertex": 0.99}
-# Most segments on each edge of a cage: of uniform and of adaptive tessellations.
-MOST_SEGMENTS, FINEST_RATE = 8, 64
+MOST_SEGMENTS, FINEST_RATE = 8, 64  # Most segments on each edge of a cage: of uniform and of adaptive tessellations
 # Most triangles of a scene; and the number of uniform triangles that take as long as choosing adaptive ones.
 MOST_TRIANGLES, FEW_TRIANGLES = 4_000_000, 20_000
 # Samples per pixel of albedo and normals, one ray each; 256 improve neither edges nor blurred parts.

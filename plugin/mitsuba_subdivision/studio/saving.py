@@ -29,8 +29,7 @@ _ARRAYS = ("positions", "face_sizes", "face_vertices", "creases", "corners", "ho
 _OF_CAGE = (*_ARRAYS, *RULES)
 _NUMBERS = re.compile(r"<(float|rgb|spectrum|point|vector) [^>]*>")
 _NUMBER = re.compile(r"(?<![\w.])-?\d+\.?\d*(?:e[-+]?\d+)?(?![\w.])")
-# Placeholder of a transform while the scene is written.
-_PLACEHOLDER = "in place of transform"
+_PLACEHOLDER = "in place of transform"  # Placeholder of a transform while the scene is written
 _TRANSFORM = re.compile(rf'( *)<string name="([^"]*)" value="{_PLACEHOLDER} (\d+)"/>\n')
 DIGITS = 9  # Significant digits where single precision is not enough
 _ORTHOGONAL = 1e-6  # Tolerance for the orthogonality of a matrix written as scale and direction
@@ -204,8 +203,7 @@ def _contents(entry: SceneNode) -> CageContents:
     arrays = {key: np.array(entry[key]) for key in _ARRAYS if key in entry}
     rules = {key: entry[key] for key in RULES if key in entry}
     data = read_attributes(entry)
-    # Warnings were issued when the scene was made.
-    with without_warnings():
+    with without_warnings():  # Warnings were issued when the scene was made
         return ControlCage.from_arrays(**arrays, **rules, **data).contents
 
 
@@ -234,8 +232,7 @@ def _suffix_for(name: str, contents: CageContents) -> str:
 
 
 def _with_name(path: Path, kept: SceneNode) -> SceneNode:
-    # The type comes first, as `mi.load_dict` expects.
-    return {"type": kept.pop("type"), "filename": str(path), **kept}
+    return {"type": kept.pop("type"), "filename": str(path), **kept}  # The type comes first, as `mi.load_dict` expects
 
 
 def _relative(path: Path, folder: Path) -> str:

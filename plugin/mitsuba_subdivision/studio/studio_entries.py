@@ -48,8 +48,7 @@ LIGHTS = {
 }
 STUDIO = (*LIGHTS, "ambient_light", "ground")
 ENVIRONMENT = "environment"
-# Entries that turn with the camera.
-RIG = (*LIGHTS, "ground", ENVIRONMENT)
+RIG = (*LIGHTS, "ground", ENVIRONMENT)  # Entries that turn with the camera
 AMBIENT, BACKDROP_COLOUR = (0.17, 0.175, 0.185), (0.30, 0.305, 0.315)
 # Types of Mitsuba's integrator `aov`, by names of Mitsuba, Hydra and other renderers.
 AOVS = {name: name for name in ("albedo", "depth", "position", "uv", "geo_normal", "sh_normal", "dp_du", "dp_dv")}

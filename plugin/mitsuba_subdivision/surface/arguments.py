@@ -13,8 +13,7 @@ from ..patches.patch_table import PatchTable
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 
-# Distance by which rounding may put a parameter outside its domain.
-DOMAIN_TOLERANCE = 1e-12
+DOMAIN_TOLERANCE = 1e-12  # Distance by which rounding may put a parameter outside its domain
 # Most faces around a vertex, and most corners of a face, as in OpenSubdiv. Eigenbases of such one-rings take 3 seconds.
 MOST_FACES = 511
 # Most faces around a vertex at the end of a crease, or with semi-sharp features: each face has a different one-ring,
