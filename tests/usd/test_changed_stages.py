@@ -203,53 +203,41 @@ def test_models_of_a_millimetre_and_of_kilometres_are_the_same_picture(tmp_path)
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_light_weights_follow_contributions_and_keep_the_mean(tmp_path):
-    def loaded(count):
-        powers = [40 if i == 2 else 0.2 for i in range(count)]
-        lamps = [
-            prim("SphereLight", f"l{i}", f"float inputs:intensity = {p}", moved(translate=(i - 4, -3, 4)))
-            for i, p in enumerate(powers)
-        ]
-        path = write(tmp_path, STILL + prim("Mesh", "floor", SQUARE, moved(scale=(9, 9, 1))) + "".join(lamps) + CAMERA)
-        return load_scene(msub.usd_scene(path, mi, size=(16, 12), shading="vertex", **RATE), None, "box").scene
+    """By weights of the loaded scene or of its entries: of lamps, a sky, and meshes that shine, subdivided or not."""
+    coordinates = f'texCoord2f[] primvars:st = [{"(0, 0), (1, 1)," * 4}] (interpolation = "vertex")'
+    mesh_light = {"apis": ["MeshLightAPI"]}
+    lights = [
+        prim("SphereLight", "emitter", "float inputs:intensity = 0.2", moved(translate=(-4, -3, 4))),
+        prim("SphereLight", "strong", "float inputs:intensity = 40", moved(translate=(-2, -3, 4))),
+        prim("Mesh", "panel", SQUARE, "float inputs:intensity = 0.02", moved(translate=(0, 0, 4)), **mesh_light),
+        prim("Mesh", "glow", CUBE, coordinates, "float inputs:intensity = 0.02", **mesh_light),
+        DULL_SKY.replace("0.5", "0.01"),
+    ]
+    floor = prim("Mesh", "floor", SQUARE, moved(scale=(9, 9, 1)))
+
+    def loaded(count, **more):
+        # Loading takes the tensor out of its dictionary.
+        bitmap = {"type": "bitmap", "raw": True, "data": mi.TensorXf(np.full((2, 2, 1), 0.01, np.float32))}
+        path, more = write(tmp_path, floor + "".join(lights[:count]) + CAMERA), {**more, "displacement": bitmap, **RATE}
+        return load_scene(msub.usd_scene(path, mi, size=(16, 12), shading="vertex", **more), None, "box").scene
 
     def pictures(scene):
         return np.array([np.array(mi.render(scene, spp=16, seed=seed))[..., 0] for seed in range(12)])
 
-    scene = loaded(LEAST_LIGHTS)
+    def weights(scene):
+        return [float(mi.traverse(light)["sampling_weight"]) for light in scene.emitters()]
+
+    scene = loaded(len(lights))
     before = pictures(scene)
     assert msub.weigh_lights(scene)
     after = pictures(scene)
     assert np.median(after.var(axis=0)) < 0.6 * np.median(before.var(axis=0))
     error = np.sqrt((before.var(axis=0).sum() + after.var(axis=0).sum()) / len(before)) / before[0].size
     assert abs(after.mean() - before.mean()) < 4 * error
-    weights = [float(mi.traverse(light)["sampling_weight"]) for light in scene.emitters()]
-    assert min(weights) == pytest.approx(0.03, rel=1e-6)
+    assert min(weights(scene)) == pytest.approx(0.03, rel=1e-6)
+    of_entries = loaded(len(lights), weigh_lights=True)
+    assert weights(of_entries) == weights(scene)
+    np.testing.assert_array_equal(*(np.array(mi.render(each, spp=16)) for each in (of_entries, scene)))
     # Weights that are given stay, and few lights are chosen alike.
     assert not msub.weigh_lights(scene)
     assert not msub.weigh_lights(loaded(LEAST_LIGHTS - 1))
-
-
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
-def test_entries_of_lights_have_the_weights_of_the_loaded_scene(tmp_path):
-    """Lamps with and without a shape, a sky, and meshes that shine, subdivided or not."""
-    coordinates = f'texCoord2f[] primvars:st = [{"(0, 0), (1, 1)," * 4}] (interpolation = "vertex")'
-    shines = {"apis": ["MeshLightAPI"]}
-    lights = [
-        prim("SphereLight", "emitter", "float inputs:intensity = 30", moved(translate=(3, -3, 4))),
-        prim("DistantLight", "sun", "float inputs:intensity = 0.3"),
-        prim("Mesh", "glow", CUBE, coordinates, "float inputs:intensity = 2", moved(translate=(-2.6, 0, 0)), **shines),
-        prim("Mesh", "panel", SQUARE, "float inputs:intensity = 4", moved(translate=(0, 0, 3)), **shines),
-    ]
-    floor = prim("Mesh", "floor", SQUARE, moved(scale=(9, 9, 1)))
-    path = write(tmp_path, floor + DULL_SKY + "".join(lights) + CAMERA)
-    scenes = []
-    for weighs in (False, True):
-        # Loading takes the tensor out of its dictionary.
-        bitmap = {"type": "bitmap", "raw": True, "data": mi.TensorXf(np.full((2, 2, 1), 0.01, np.float32))}
-        entries = msub.usd_scene(path, mi, size=(16, 12), weigh_lights=weighs, displacement=bitmap, **RATE)
-        scenes.append(load_scene(entries, None, "box").scene)
-    assert msub.weigh_lights(scenes[0])
-    expected, given = ([float(mi.traverse(e)["sampling_weight"]) for e in s.emitters()] for s in scenes)
-    assert len(expected) == 5
-    assert given == expected
-    np.testing.assert_array_equal(*(np.array(mi.render(scene, spp=16, seed=1)) for scene in scenes))
