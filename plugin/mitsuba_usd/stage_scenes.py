@@ -380,4 +380,6 @@ def usd_scene(
         look = studio.Look(view, size, spp, texture_size=texture_size, transparent=transparent)
         source = StageScenes(path, look, parameters, time=time, camera=camera, over=over)
         scene = with_meshes(studio.StillPicture(source).scene)
-        return studio.with_light_weights(scene) if weigh_lights else scene
+        if weigh_lights:
+            studio.set_light_weights(scene)
+        return scene

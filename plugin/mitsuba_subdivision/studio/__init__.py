@@ -13,10 +13,10 @@ from .picture import (
     pixels_of_boxes,
     render_denoised,
     segments_for,
+    set_light_weights,
     shading_for,
     triangles_for,
     weigh_lights,
-    with_light_weights,
 )
 from .studio_entries import (
     AOVS,
@@ -31,13 +31,12 @@ from .studio_entries import (
     finished,
     sampler,
     studio,
-    variant_in_use,
 )
 
 __all__ = [
     "AOVS", "DEFAULT_SIZE", "DEFAULT_SPP", "DEFAULT_VIEW", "ENVIRONMENT", "ERRORS", "HIGHEST_RATE", "MOST_SEGMENTS",
     "MOST_TRIANGLES", "STUDIO", "LoadedScene", "Look", "SceneSource", "StillPicture", "View", "enlargement", "finished",
     "frame_table", "highest_rate", "load_quietly", "outline_for", "pixels_of_boxes", "render_denoised", "sampler",
-    "segments_for", "set_parameters", "shading_for", "studio", "studio_scene", "triangles_for", "variant_in_use",
-    "weigh_lights", "with_light_weights",
+    "segments_for", "set_light_weights", "set_parameters", "shading_for", "studio", "studio_scene", "triangles_for",
+    "weigh_lights",
 ]  # fmt: skip

@@ -175,25 +175,19 @@ def weigh_lights(scene: mi.Scene, sensor: int = 0) -> bool:
     return pays
 
 
-def with_light_weights(scene: SceneNode) -> SceneNode:
-    """Entries of a scene whose lights have the weights that `weigh_lights` gives to those of the loaded scene.
-
-    Objects among the entries are changed themselves.
-    """
+def set_light_weights(scene: SceneNode) -> None:
+    """Set the weights of `weigh_lights` in a scene's entries of lights, and in objects among them."""
     loaded = load_quietly(_copied(scene)).scene
-    result = dict(scene)
     for light in loaded.emitters() if weigh_lights(loaded) else ():
-        weight = {"sampling_weight": float(np.ravel(np.array(mi.traverse(light)["sampling_weight"]))[0])}
         shape = light.get_shape()
-        name = light.id() if shape is None else shape.id()
-        entry = result.get(name)
+        entry = scene.get(light.id() if shape is None else shape.id())
         if isinstance(entry, dict):
-            result[name] = {**entry, **(weight if shape is None else {"emitter": {**entry["emitter"], **weight}})}
-    return result
+            of_light = entry if shape is None else entry["emitter"]
+            of_light["sampling_weight"] = float(np.ravel(np.array(mi.traverse(light)["sampling_weight"]))[0])
 
 
 def _copied(entry: Any) -> Any:
-    """An entry with other tensors, as `mi.load_dict` takes those of bitmaps out of their dictionaries."""
+    """An entry with tensors of its own, as `mi.load_dict` takes those of bitmaps out of their dictionaries."""
     if isinstance(entry, dict):
         return {name: _copied(part) for name, part in entry.items()}
     return mi.TensorXf(entry) if isinstance(entry, mi.TensorXf) else entry
