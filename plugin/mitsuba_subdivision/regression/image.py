@@ -202,7 +202,7 @@ def save_image(path: str | Path, image: Image) -> None:
 
 def load_image(path: str | Path) -> Image:
     """Read an OpenEXR file with R, G and B; raise RegressionError for any other file."""
-    channels, metadata, origin, has_data = _read(path)
+    channels, metadata, origin, has_data = read_channels(path)
     source = str(path)
     if (schema := metadata.get("schema", SCHEMA)) != SCHEMA:
         raise RegressionError(f'image "{source}" has metadata of schema {schema}; this version reads schema {SCHEMA}')
@@ -320,17 +320,13 @@ def write_channels(path: str | Path, channels: Mapping[str, NDArray], metadata: 
         file.write(str(beside))
 
 
-def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any]]:
-    """Channels ``(height, width)`` by name of a file of one part, and its metadata, empty if there is none.
+def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any], tuple[int, int], NDArray[np.bool_]]:
+    """Channels ``(height, width)`` by name of a file of one part, its metadata, if any, and what has data.
 
-    Channels cover the display window, and are empty outside the data window: 0, and no shape. Raises RegressionError if
-    the file cannot be read, or has several parts, deep pixels or broken metadata.
+    Channels show the display window, whose first column and row and a mask of its pixels with data come last. Outside
+    the data window, channels are empty: 0, and no shape. Raises RegressionError if the file cannot be read, or has
+    several parts, deep pixels or broken metadata.
     """
-    return _read(path)[:2]
-
-
-def _read(path: str | Path) -> tuple[Channels, dict[str, Any], tuple[int, int], NDArray[np.bool_]]:
-    """Result of `read_channels`, first column and row of the display window, and a mask of its pixels with data."""
     path = Path(path)
     if not path.is_file():
         raise RegressionError(f'image "{path}" is not a file; expected an OpenEXR file')
