@@ -45,13 +45,10 @@ TURNS = Rotation.random(20, random_state=19).as_matrix()  # Rotations of the fig
 # 0.41 and 0.55 (Catmull-Clark), 0.25 and 0.45 (Loop), 0.5 (Doo-Sabin). For smaller ones, samples of the same u and v
 # are closer to the point. The rates make triangles there about equally large.
 ROWS = {
-    ("catmull_clark", 3): (1e-6, 3),
-    ("catmull_clark", 5): (1e-8, 4),
-    ("loop", 3): (1e-4, 2),
-    ("loop", 5): (1e-7, 4),
-    ("doo_sabin", 3): (1e-7, 4),
-    ("doo_sabin", 5): (1e-7, 4),
-}
+    ("catmull_clark", 3): (1e-6, 3), ("catmull_clark", 5): (1e-8, 4),
+    ("loop", 3): (1e-4, 2), ("loop", 5): (1e-7, 4),
+    ("doo_sabin", 3): (1e-7, 4), ("doo_sabin", 5): (1e-7, 4),
+}  # fmt: skip
 # Title, evaluator, and whether samples lie beside the extraordinary point; all in float32.
 RULES: tuple[tuple[str, Evaluator, bool], ...] = (
     ("Stam's form (11)", "stam", True),

@@ -21,12 +21,8 @@ from ..variants import SceneNode
 
 # Azimuth and elevation in degrees. Azimuth 0 is the model's front, 90 its own left, which is +x.
 VIEWS = {
-    "front": (0.0, 0.0),
-    "side": (90.0, 0.0),
-    "back": (180.0, 0.0),
-    "top": (0.0, 90.0),
-    "three-quarter": (35.0, 18.0),
-}
+    "front": (0.0, 0.0), "side": (90.0, 0.0), "back": (180.0, 0.0), "top": (0.0, 90.0), "three-quarter": (35.0, 18.0),
+}  # fmt: skip
 DEFAULT_VIEW = "three-quarter"
 UP_AXES = ("y", "z")
 View = str | Sequence[float]
