@@ -139,8 +139,7 @@ def _lost_at(cage: ControlCage) -> float:
 
 
 def _draw_lines(axis: Axes, sensor: mi.Sensor, surface: LimitSurface, mesh: Tessellation, to_world: FloatArray) -> None:
-    distance = np.linalg.norm(mesh.positions - mesh.positions[0], axis=1)
-    near = np.flatnonzero(distance < NEEDLE_RADIUS)
+    near = np.flatnonzero(np.linalg.norm(mesh.positions - mesh.positions[0], axis=1) < NEEDLE_RADIUS)
     start = mesh.positions[near].astype(np.float64)
     needles = np.stack([start, start + NEEDLE_LENGTH * mesh.normals[near]], axis=1)
     edges = edge_curves(surface, np.arange(surface.patches.elements.half_edge_count), 16)
@@ -224,8 +223,7 @@ def normal_errors(cage: ControlCage, exact: FloatArray, evaluator: Evaluator, dt
     uv = (np.ldexp(1.0, -LEVELS)[:, None, None] * DIRECTIONS).reshape(-1, 2)
     normals = LimitSurface(cage).evaluate(0, uv, evaluator=evaluator, dtype=dtype).n.astype(np.float64)
     # Parallel or zero derivatives give no normal, which counts as the largest error.
-    angle = np.nan_to_num(normal_angle(normals, exact), nan=180)
-    return angle.reshape(len(LEVELS), -1).max(axis=1)
+    return np.nan_to_num(normal_angle(normals, exact), nan=180).reshape(len(LEVELS), -1).max(axis=1)
 
 
 def exact_normals(cage: ControlCage) -> NDArray[np.float64]:
