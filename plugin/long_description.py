@@ -28,8 +28,7 @@ class LongDescription(MetadataHookInterface):
     def update(self, metadata: dict[str, Any]) -> None:
         """Set the field ``readme`` of the package's metadata."""
         text = (Path(self.root) / "README.md").read_text(encoding="utf-8")
-        repository = metadata.get("urls", {}).get("Repository")
-        text = long_description(text, repository, f"v{metadata['version']}")
+        text = long_description(text, metadata.get("urls", {}).get("Repository"), f"v{metadata['version']}")
         metadata["readme"] = {"content-type": "text/markdown", "text": text}
 
 

@@ -180,7 +180,6 @@ def _libraries(patterns: Iterable[str]) -> list[str]:
 
 
 def _python_folders() -> list[str]:
-    """Folders of libraries of the Python environment, and of packages in other folders."""
     prefixes = [sys.prefix, sys.base_prefix, site.getuserbase(), *filter(None, sys.path)]
     # Wheels have libraries two folders above their modules, or directly below them with `pip install --target`.
     above = [os.path.dirname(os.path.dirname(folder)) for folder in sys.path if folder.endswith("-packages")]

@@ -117,8 +117,7 @@ class _Surface:
             kept = {k: v for k, v in given.inputs.items() if k and (given.category, k) not in self._lacking}
             return {"type": given.category, **{key: self._plugin(value, key) for key, value in kept.items()}}
         if isinstance(given, list):
-            is_matrix = len(given) == 9
-            return mi.ScalarAffineTransform3f(np.reshape(given, (3, 3)).tolist()) if is_matrix else rgb(given)
+            return mi.ScalarAffineTransform3f(np.reshape(given, (3, 3)).tolist()) if len(given) == 9 else rgb(given)
         if isinstance(given, TextureContents) and name in _RAW:
             return self._textures.color(given, is_raw=True)
         if isinstance(given, (TextureContents, NodeContents, PrimvarContents)):
@@ -171,7 +170,6 @@ class _Surface:
         self._notes.add(what, self._shape.name if self._material is None else self._material.name)
 
     def bsdf(self) -> SceneNode:
-        """The BSDF with its normal map and opacity."""
         if self._material is None:
             color = self._color(PrimvarContents("displayColor", GREY))
             opacity = self.number(PrimvarContents("displayOpacity", [1.0]))
@@ -181,8 +179,7 @@ class _Surface:
             return own or _both_sides({"type": "diffuse", "reflectance": rgb(GREY)})
         weight = self._inputs["transmission"]
         if not self._is("transmission", 0):
-            opaque = node("invert", "float", in_=self._inputs["metalness"], amount=1.0)
-            weight = number("multiply", weight, opaque)
+            weight = number("multiply", weight, node("invert", "float", in_=self._inputs["metalness"], amount=1.0))
         if is_constant(weight) and _first(weight) <= 0:
             entry = self._opaque()
         elif is_constant(weight) and _first(weight) >= 1:
@@ -205,7 +202,6 @@ class _Surface:
         return {"type": "blendbsdf", "weight": weight, "bsdf_0": entry, "bsdf_1": _both_sides(coat)}
 
     def _with_normal_map(self, bsdf: SceneNode, name: str = "normal", *, is_diffuse: bool = True) -> SceneNode:
-        """A BSDF with a normal map, if there is one."""
         normal = self._for_shape(self._inputs.get(name, 0.0))
         normals = self._textures.normals(normal) if isinstance(normal, (TextureContents, NodeContents)) else None
         if normals is None:
@@ -220,7 +216,9 @@ class _Surface:
             return self._with_normal_map(self._sheet(0.0))
         is_bare = self._is("sheen", 0)
         if is_bare and self._is("metalness", 1) and is_constant(self._inputs["base_color"]):
-            return _both_sides(self._with_normal_map(self._metal(), is_diffuse=False))
+            n, k = conductor(constant(self._inputs["base_color"], 3), self._mean("edge_color"))
+            metal = {**_specular("conductor", self._widths("roughness", self._ratio())), "eta": rgb(n), "k": rgb(k)}
+            return _both_sides(self._with_normal_map(metal, is_diffuse=False))
         if is_bare and self._is("metalness", 0) and (self._is("specular", 0) or self._is("specular_color", 0)):
             diffuse = {"type": "diffuse", "reflectance": self._color(self._inputs["base_color"])}
             return _both_sides(self._with_normal_map(diffuse))
@@ -243,15 +241,10 @@ class _Surface:
             entry["anisotropic"] = self.number(number("divide", rest, 0.9))
         if not self._is("sheen", 0):
             color = np.broadcast_to(self._mean("sheen_color"), (3,))
-            brightness = float(color @ LUMINANCE)
-            entry["sheen"] = self.number(number("multiply", inputs["sheen"], brightness))
+            entry["sheen"] = self.number(number("multiply", inputs["sheen"], float(color @ LUMINANCE)))
             if np.ptp(color) > 0:
                 self._note("colours of sheen only set its brightness; it is white")
         return entry
-
-    def _metal(self) -> SceneNode:
-        n, k = conductor(constant(self._inputs["base_color"], 3), self._mean("edge_color"))
-        return {**_specular("conductor", self._widths("roughness", self._ratio())), "eta": rgb(n), "k": rgb(k)}
 
     def _glass(self) -> SceneNode:
         if not self._is("thin", 0):
@@ -334,8 +327,7 @@ def _index(reflectance: float) -> float:
 
 def rgb(value: ArrayLike) -> SceneNode:
     """A colour of Mitsuba; a single number is grey."""
-    numbers = np.broadcast_to(np.asarray(value, dtype=np.float64).ravel()[:3], 3)
-    return {"type": "rgb", "value": numbers.tolist()}
+    return {"type": "rgb", "value": np.broadcast_to(np.asarray(value, dtype=np.float64).ravel()[:3], 3).tolist()}
 
 
 def _first(value: Any) -> float:

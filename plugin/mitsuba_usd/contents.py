@@ -180,9 +180,8 @@ class CameraContents:
     focal_length: float
     near: float
     far: float
-    # In the world's unit; 0 without depth of field
-    lens_radius: float
-    focus_distance: float
+    lens_radius: float  # In the world's unit; 0 without depth of field
+    focus_distance: float  # Likewise
     shutter: list[float]  # Time codes of its opening and closing, relative to the frame
     conform_policy: str = "expandAperture"  # Value of aspectRatioConformPolicy
     mitsuba: dict[str, Any] = field(default_factory=dict)  # Authored parameters of Mitsuba's sensor

@@ -135,8 +135,7 @@ def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> S
     vertex, face = (step * np.arange(count)[:, None] for step in (len(cage.positions), len(cage.face_sizes)))
     normals = shape.normals
     if normals is not None:
-        of_copies = normals @ np.linalg.inv(linear)
-        normals = np.take_along_axis(of_copies, corners[..., None], axis=1).reshape(-1, 3)
+        normals = np.take_along_axis(normals @ np.linalg.inv(linear), corners[..., None], axis=1).reshape(-1, 3)
     copied = CageContents(
         positions.reshape(-1, 3),
         np.tile(cage.face_sizes, count),

@@ -90,8 +90,7 @@ def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
     try:
         with Ar.GetResolver().OpenAsset(resolved) as asset:
             text = bytes(asset.GetBuffer()).decode()
-        search = MaterialX.FileSearchPath(str(Path(str(resolved)).parent))
-        MaterialX.readFromXmlString(document, text, search)
+        MaterialX.readFromXmlString(document, text, MaterialX.FileSearchPath(str(Path(str(resolved)).parent)))
         document.setSourceUri(str(resolved))
         for node in document.getMaterialNodes():
             _add_material(stage, node)

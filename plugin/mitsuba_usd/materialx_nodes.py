@@ -134,8 +134,7 @@ def _smooth_step(n: SimpleNamespace) -> Values:
 
 
 def _luminance(n: SimpleNamespace) -> Values:
-    coefficients = getattr(n, "lumacoeffs", LUMINANCE)
-    luma = np.sum(n.in_[..., :3] * coefficients, axis=-1, keepdims=True)
+    luma = np.sum(n.in_[..., :3] * getattr(n, "lumacoeffs", LUMINANCE), axis=-1, keepdims=True)
     return _with_alpha(np.broadcast_to(luma, (*luma.shape[:-1], 3)), n.in_)
 
 

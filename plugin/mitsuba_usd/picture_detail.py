@@ -194,8 +194,7 @@ def with_own_parameters(
                 rate = 8 * studio.MOST_SEGMENTS
             else:
                 pixels = pixels_of(shape.cage, placements[shape], seen) if seen else np.inf
-                error = studio.ERRORS[parameters["shading"]] / pixels
-                rate = max(rate, rate_of_heights(shape.cage, texture, error))
+                rate = max(rate, rate_of_heights(shape.cage, texture, studio.ERRORS[parameters["shading"]] / pixels))
             displaced[shape]["tessellation_rate"] = max(1, min(rate, highest))
     for shape in contents.all_shapes if sensors is not None else ():
         if shape.rate is not None and shape.cage.scheme is not None:

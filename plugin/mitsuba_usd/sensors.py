@@ -115,8 +115,7 @@ def angles_for(contents: SceneContents, look: Look) -> View:
         return look.view
     back = contents.camera.to_world[:3, 2]
     right, behind, above = back if contents.up == "z" else (back[0], -back[2], back[1])
-    azimuth = math.degrees(math.atan2(right, -behind))
-    return azimuth, math.degrees(math.asin(np.clip(above, -1, 1)))
+    return math.degrees(math.atan2(right, -behind)), math.degrees(math.asin(np.clip(above, -1, 1)))
 
 
 def with_studio_defaults(

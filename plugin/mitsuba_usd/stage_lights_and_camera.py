@@ -15,14 +15,10 @@ from .stage_warnings import StageWarnings
 
 # Kind of each type of light, and attributes of its size.
 _KINDS: dict[str, tuple[str, ...]] = {
-    "DistantLight": ("distant", "inputs:angle"),
-    "RectLight": ("rect", "inputs:width", "inputs:height"),
-    "DiskLight": ("disk", "inputs:radius"),
-    "SphereLight": ("sphere", "inputs:radius"),
-    "CylinderLight": ("cylinder", "inputs:length", "inputs:radius"),
-    "DomeLight": ("dome",),
-    "DomeLight_1": ("dome",),
-}
+    "DistantLight": ("distant", "inputs:angle"), "RectLight": ("rect", "inputs:width", "inputs:height"),
+    "DiskLight": ("disk", "inputs:radius"), "SphereLight": ("sphere", "inputs:radius"),
+    "CylinderLight": ("cylinder", "inputs:length", "inputs:radius"), "DomeLight": ("dome",), "DomeLight_1": ("dome",),
+}  # fmt: skip
 _POINTLIKE = 1.0  # Largest angle in degrees of distant lights without a warning: twice the Sun's
 _CONE = "inputs:shaping:cone:angle"
 # Ignored attributes of lights, their values without effect, and the reason.

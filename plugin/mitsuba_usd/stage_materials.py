@@ -73,8 +73,7 @@ def _path_of(asset: Any, attribute: Usd.Attribute, time: Usd.TimeCode) -> str:
     if asset.resolvedPath or UDIM not in asset.path:
         return str(asset.resolvedPath or asset.path)
     # USD does not resolve <UDIM>; the path is relative to the layer of the opinion.
-    layer = attribute.GetPropertyStack(time)[0].layer
-    return UsdShade.UdimUtils.ResolveUdimPath(asset.path, layer) or asset.path
+    return UsdShade.UdimUtils.ResolveUdimPath(asset.path, attribute.GetPropertyStack(time)[0].layer) or asset.path
 
 
 class MaterialReader:
@@ -360,8 +359,7 @@ class MaterialReader:
             return _SPECIAL[category](self, kind, inputs, prim)
         there = {name: value for name, value in inputs.items() if value is not None}
         if kind not in nodes.CHANNELS or not is_known or len(there) < len(inputs):
-            what = f'MaterialX nodes "{category}" are ignored; their first input is used instead, or 0'
-            self._notes.add(what, prim)
+            self._notes.add(f'MaterialX nodes "{category}" are ignored; their first input is used instead, or 0', prim)
             return next((value for name, value in there.items() if name.startswith("in")), 0.0)
         size = sum(self._sizes.get(id(value), 1) for value in there.values() if not nodes.is_constant(value))
         if size > _MOST_NODES:

@@ -20,17 +20,9 @@ from mitsuba_subdivision.mitsuba_mesh import with_meshes
 from mitsuba_subdivision.variants import SceneNode, variant_set
 from numpy.typing import NDArray
 
+from . import picture_detail
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
-from .picture_detail import (
-    is_chosen,
-    largest_height,
-    segments_of,
-    texels_for_pictures,
-    triangles_for_picture,
-    with_own_parameters,
-    with_rate,
-)
 from .scaling import scaled, scaled_camera, size_of
 from .scene_entries import LoadedShapes, Surfaces, scene_entries
 from .sensors import NO_BLUR, angles_for, sensor, size_for, with_studio_defaults
@@ -67,7 +59,8 @@ class StageScenes(studio.SceneSource[SceneContents]):
     ) -> None:
         super().__init__(path, f'"{path}"', look, time, numbers)
         self._shutter, self._interval, self._over, self._camera = shutter, interval, over, camera
-        self._spp, self._parameters, self._has_free_rates = look.spp, parameters, not is_chosen(parameters)
+        self._spp, self._parameters = look.spp, parameters
+        self._has_free_rates = not picture_detail.is_chosen(parameters)
         if shutter and self._has_files:
             raise CageError(f"{self.name}: there is one file for each frame; expected times of one file for a shutter")
         self._reader: StageReader | None = None
@@ -103,7 +96,7 @@ class StageScenes(studio.SceneSource[SceneContents]):
             dark = [replace(shape, radiance=None) for shape in contents.shapes]
             shines = any(shape.radiance is not None for shape in contents.shapes)
             contents = replace(contents, lights=[], shapes=dark if shines else contents.shapes)
-        self._parameters = with_rate(self._parameters, contents)
+        self._parameters = picture_detail.with_rate(self._parameters, contents)
         if contents.has_surfaces:
             self._parameters = {**self._parameters, "shading": studio.shading_for(self._parameters)}
         self._is_lit |= contents.is_lit
@@ -146,7 +139,7 @@ class StageScenes(studio.SceneSource[SceneContents]):
         if not displaced or contents.camera is not None or "displacement" in self._parameters:
             return self._surfaces.points(contents)
         textures = Textures(self._notes, most=_MOST_FRAMED)  # The studio's camera sees displaced surfaces
-        heights = {shape: largest_height(shape, textures, self._notes) for shape in displaced}
+        heights = {shape: picture_detail.largest_height(shape, textures, self._notes) for shape in displaced}
         return self._surfaces.points(contents, heights)
 
     def has_studio(self, contents: SceneContents) -> bool:
@@ -190,14 +183,14 @@ class StageScenes(studio.SceneSource[SceneContents]):
         if rest and (turns or follows_sensor):
             place, transform = rest["sensor"]["to_world"], mi.ScalarTransform4f
             moved = [{**rest["sensor"], "to_world": transform(turn.tolist()) @ place} for turn in turns]
-            needed = texels_for_pictures(contents, moved or [rest["sensor"]])
+            needed = picture_detail.texels_for_pictures(contents, moved or [rest["sensor"]])
         if rest and is_one_picture:
             contents, chosen = self._for_picture(contents, rest["sensor"], follows_sensor)
         else:
             contents, parameters = self._with_copies(contents)
         textures = Textures(self._notes, needed, self._look.texture_size)
         sees = [rest["sensor"]] if rest and self._has_free_rates else None
-        chosen = with_own_parameters(contents, chosen, parameters, sees, textures, self._notes)
+        chosen = picture_detail.with_own_parameters(contents, chosen, parameters, sees, textures, self._notes)
         scene = scene_entries(contents, rest, self._notes, parameters, self._surfaces, textures, chosen)
         self._notes.warn(self.name)
         if not rest:
@@ -210,12 +203,14 @@ class StageScenes(studio.SceneSource[SceneContents]):
         if not self._has_free_rates or not contents.has_surfaces:
             return self._with_copies(contents)[0], {}
         outline, shading = studio.outline_for(sensor), self._parameters["shading"]
-        segments = segments_of(contents, self._surfaces, outline, sensor["near_clip"], shading)
+        segments = picture_detail.segments_of(contents, self._surfaces, outline, sensor["near_clip"], shading)
         rates: dict[ShapeContents, int] = {}
         if mi.Float is not float:
             most = {shape: np.minimum(needed, studio.MOST_SEGMENTS) for shape, needed in segments.items()}
             contents, rates = with_copies(contents, most, shading, self._notes)
-        triangles = triangles_for_picture(contents, segments, outline, self._parameters, follows_sensor=follows_sensor)
+        triangles = picture_detail.triangles_for_picture(
+            contents, segments, outline, self._parameters, follows_sensor=follows_sensor
+        )
         triangles |= {shape: {"tessellation_rate": rate} for shape, rate in rates.items()}
         others = {name: value for name, value in self._parameters.items() if name != "tessellation_rate"}
         return contents, {shape: {**others, **more} for shape, more in triangles.items()}
@@ -255,7 +250,7 @@ class StageScenes(studio.SceneSource[SceneContents]):
             shapes.begin_frame()
             textures = Textures(self._notes, self._needed, self._look.texture_size)
             any_sensor: list[SceneNode] | None = [] if self._has_free_rates else None
-            chosen = with_own_parameters(contents, {}, parameters, any_sensor, textures, self._notes)
+            chosen = picture_detail.with_own_parameters(contents, {}, parameters, any_sensor, textures, self._notes)
             made = contents, {**rest, "sensor": seen}, self._notes, parameters, Surfaces(), textures, chosen
             scene = scene_entries(*made, loaded=shapes)
             self._notes.warn(self.name)
@@ -277,7 +272,7 @@ class StageScenes(studio.SceneSource[SceneContents]):
         for _, alike in groupby(at, lambda contents: contents.shapes):
             frames = list(alike)
             seen = [self._sensor(frame, first, rest) for frame in frames]
-            for file, texels in texels_for_pictures(frames[0], seen).items():
+            for file, texels in picture_detail.texels_for_pictures(frames[0], seen).items():
                 needed[file] = max(texels, needed.get(file, 0.0))
         return needed
 

@@ -112,8 +112,7 @@ def _variables(product: UsdRender.Product, aovs: dict[str, str], time: Usd.TimeC
 def namespaced(prim: Usd.Prim, namespace: str, time: Usd.TimeCode) -> dict[str, Any]:
     """Attributes of a prim in a namespace as nested dictionaries, one for each part of the name."""
     found: dict[str, Any] = {}
-    inside = (given for given in prim.GetAuthoredAttributes() if given.GetName().startswith(f"{namespace}:"))
-    for attribute in inside:
+    for attribute in (given for given in prim.GetAuthoredAttributes() if given.GetName().startswith(f"{namespace}:")):
         *groups, name = attribute.GetName().removeprefix(f"{namespace}:").split(":")
         within = found
         for group in groups:

@@ -82,8 +82,7 @@ class StageReader:
 
 def is_still(stage: Usd.Stage) -> bool:
     """Whether nothing but cameras and their rigs may vary with time."""
-    moving = filter(_may_vary, _all_prims(stage))
-    below = (part for prim in moving for part in Usd.PrimRange.AllPrims(prim))
+    below = (part for prim in filter(_may_vary, _all_prims(stage)) for part in Usd.PrimRange.AllPrims(prim))
     return all(str(part.GetTypeName()) in _OF_RIGS and not part.IsInstance() for part in below)
 
 
@@ -206,8 +205,7 @@ class _StageWalk:
 
         if prim != root and prim.IsInstance():
             if are_invertible(placed := matrix()):
-                group = self._prototype(self._appearance(prim), prim)
-                below.instances.append(InstanceContents(name, group, placed))
+                below.instances.append(InstanceContents(name, self._prototype(self._appearance(prim), prim), placed))
             else:
                 self._notes.add(_SINGULAR, prim.GetPath())
         elif not prim.IsA(UsdGeom.Imageable) or UsdGeom.Imageable(prim).ComputePurpose() in files.HIDDEN_PURPOSES:
@@ -344,8 +342,7 @@ def _can_be_instanced(prototype: SceneContents) -> bool:
     """Whether Mitsuba can instance a prototype: not with emitters, nor attributes, which need hits in object space."""
     shapes = prototype.shapes
     shines = any(shape.radiance is not None or (shape.material and shape.material.is_emissive) for shape in shapes)
-    has_attributes = any(shape.cage.attributes for shape in shapes)
-    return bool(shapes) and not (prototype.lights or shines or has_attributes)
+    return bool(shapes) and not (prototype.lights or shines or any(shape.cage.attributes for shape in shapes))
 
 
 def _parts(root: Usd.Prim) -> Usd.PrimRange:

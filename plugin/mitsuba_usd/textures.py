@@ -169,8 +169,7 @@ def _values(picture: TextureImage, texture: TextureContents) -> NDArray[np.float
     """Linear values ``(h, w, k)`` of the channels, with scale and bias; the fallback where a tile is missing."""
     channels, is_srgb = texture.channels, is_srgb_image(picture.pixels, texture.color_space)
     values = linear_values(_selected(picture.pixels, channels), is_srgb, channels)
-    numbers = np.array([texture.scale, texture.bias, texture.fallback], dtype=np.float32)
-    scale, bias, fallback = numbers[:, channels]
+    scale, bias, fallback = np.array([texture.scale, texture.bias, texture.fallback], dtype=np.float32)[:, channels]
     if (scale != 1).any() or (bias != 0).any():
         values = values * scale + bias
     if picture.has_tile is not None:
@@ -268,6 +267,5 @@ def _looked_up(values: Values, uv: Values, wrap: str) -> Values:
     height, width = values.shape[:2]
     x, y = np.moveaxis(np.atleast_2d(uv), -1, 0)  # `map_coordinates` needs an array of points
     places = (1 - y) * height - 0.5, x * width - 0.5
-    modes: dict[str, Any] = {"repeat": "grid-wrap", "mirror": "reflect", "clamp": "nearest"}
-    mode = modes[wrap]
+    mode: Any = {"repeat": "grid-wrap", "mirror": "reflect", "clamp": "nearest"}[wrap]
     return np.stack([map_coordinates(part, places, order=1, mode=mode) for part in np.moveaxis(values, -1, 0)], axis=-1)

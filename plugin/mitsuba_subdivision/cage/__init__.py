@@ -7,21 +7,7 @@ from .named_cages import cube, extraordinary
 from .validation import require_range
 
 __all__ = [
-    "Attribute",
-    "CageContents",
-    "CageError",
-    "CageSource",
-    "CageWarning",
-    "ControlCage",
-    "cage_of",
-    "cube",
-    "extraordinary",
-    "in_digits",
-    "noting_warnings",
-    "require_range",
-    "same",
-    "same_topology",
-    "shortened",
-    "warn",
+    "Attribute", "CageContents", "CageError", "CageSource", "CageWarning", "ControlCage", "cage_of", "cube",
+    "extraordinary", "in_digits", "noting_warnings", "require_range", "same", "same_topology", "shortened", "warn",
     "without_warnings",
-]
+]  # fmt: skip

@@ -232,7 +232,6 @@ def _kept(command: bytes) -> tuple[argparse.Namespace, _Shown]:
 
 
 def _shown(options: argparse.Namespace) -> _Shown:
-    """The pictures of a model, and their scene source."""
     source = _source(options)
     shown: StillPicture
     if options.frames or options.shutter:
@@ -277,7 +276,6 @@ def _source(options: argparse.Namespace) -> SceneSource[Any]:
 
 
 def _require_encoder(path: Path) -> None:
-    """Raise ValueError before rendering if a package for videos is missing."""
     try:
         import imageio.v2  # noqa: F401 - only to find out whether it is there
 

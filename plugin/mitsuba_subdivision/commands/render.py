@@ -22,18 +22,9 @@ from ..studio.picture import require_denoiser
 from ..studio.studio_entries import UP_AXES, VIEWS
 from ..variants import set_variant, variant_problem
 from ..whole_file import require_writable
+from . import pictures
 from .arguments import CommandParser, above_zero, add_cage_options, add_variant, checked, finite, index, positive, seed
 from .compare import TOLERANCES, add_tolerances
-from .pictures import (
-    DEFAULT_FPS,
-    VIDEO_SUFFIXES,
-    is_stage,
-    model_pictures,
-    picture_of_scene,
-    render_by_passes,
-    write_frames,
-    write_image,
-)
 
 IMAGE_SUFFIXES, SCENE_SUFFIX = (".exr", ".png", ".jpg", ".hdr"), ".xml"
 _OF_SCENES = ("parameters", "sensor", "share", "reference", "tolerances")  # Options for Mitsuba scenes
@@ -144,7 +135,7 @@ def render(parser: CommandParser) -> None:
         f"OPEN:CLOSE or OPEN:CLOSE:N (default: none; N: {SUB_FRAMES})"
     )
     add("--shutter", type=_shutter, metavar="N", help=text)
-    add("--fps", type=above_zero, metavar="N", help=f"frames per second of a video (default: {DEFAULT_FPS})")
+    add("--fps", type=above_zero, metavar="N", help=f"frames per second of a video (default: {pictures.DEFAULT_FPS})")
     text = 'reconstruction filter instead of the scene\'s; "box" is deterministic'
     parser.add_argument("--filter", help=text)
     text = "The image is an OpenEXR file with the variance and the number of samples of each pixel."
@@ -188,17 +179,17 @@ def _render(options: argparse.Namespace) -> None:
             hint = ", or --frames for a name of several files" if "%" in options.scene.name else ""
             raise FileNotFoundError(f'"{options.scene}": there is no such file; expected a model{hint}')
         if by_passes:
-            render_by_passes(options, is_model)
+            pictures.render_by_passes(options, is_model)
         elif options.frames or options.turntable:
-            write_frames(options)
+            pictures.write_frames(options)
         else:
-            image = next(model_pictures(options, [1]))[1] if is_model else picture_of_scene(options)
-            write_image(options, image, options.output)
+            image = next(pictures.model_pictures(options, [1]))[1] if is_model else pictures.picture_of_scene(options)
+            pictures.write_image(options, image, options.output)
 
 
 def _stated_variant(options: argparse.Namespace) -> str | None:
     """The variant of a stage's render settings; None if they have none, or it cannot run here."""
-    if not is_stage(options):
+    if not pictures.is_stage(options):
         return None
     require_usd(f'"{options.scene}"')
     from mitsuba_usd.stage_settings import read_variant
@@ -224,7 +215,7 @@ def _require_effect(options: argparse.Namespace, is_model: bool) -> None:
 def _refuse_contradictions(options: argparse.Namespace, by_passes: bool) -> None:
     """Refuse outputs of an unknown format, and options that contradict each other or have no effect."""
     suffix, has_frames = options.output.suffix.lower(), options.turntable or options.frames
-    has_other_filter = options.filter not in (None, BOX)
+    has_other_filter, videos = options.filter not in (None, BOX), pictures.VIDEO_SUFFIXES
     all_options = "--pass, --passes, --dask or --reference"
     if by_passes and suffix != ".exr":
         raise ValueError(f'output "{options.output}"; expected a name ending in .exr, which keeps the variance')
@@ -249,14 +240,14 @@ def _refuse_contradictions(options: argparse.Namespace, by_passes: bool) -> None
         raise ValueError(f'output "{options.output}" has no alpha; expected one ending in {" or ".join(_WITH_ALPHA)}')
     if options.environment and not options.environment["environment"].is_file():
         raise FileNotFoundError(f'"{options.environment["environment"]}": there is no such file; expected a picture')
-    known = (*IMAGE_SUFFIXES, *(VIDEO_SUFFIXES if has_frames else ()))
+    known = (*IMAGE_SUFFIXES, *(videos if has_frames else ()))
     if suffix not in known:
-        more = ", or --turntable or --frames for a video" if suffix in VIDEO_SUFFIXES else ""
+        more = ", or --turntable or --frames for a video" if suffix in videos else ""
         raise ValueError(f'output "{options.output}"; expected a name ending in one of {", ".join(known)}{more}')
     if options.turntable and options.frames:
         raise ValueError("--turntable turns one model, --frames shows several; expected only one of them")
-    if options.fps and suffix not in VIDEO_SUFFIXES:
-        raise ValueError(f"--fps is for videos; expected an output ending in one of {', '.join(VIDEO_SUFFIXES)}")
+    if options.fps and suffix not in videos:
+        raise ValueError(f"--fps is for videos; expected an output ending in one of {', '.join(videos)}")
     if options.passes and has_frames:
         raise ValueError("--passes are of one picture; expected no --frames or --turntable beside it")
     if options.save_scene and (options.dask or options.passes):

@@ -44,8 +44,7 @@ class DividedTile:
         self.is_piece = element is None
         # Whether the tile has an extraordinary point at a corner, so that one child equals the tile.
         self.is_self_similar = element is not None and element.kind == PartKind.TIP
-        control_count = len(self._bernstein.indices) if element is None else element.control_count
-        self._control_points = np.eye(control_count)
+        self._control_points = np.eye(len(self._bernstein.indices) if element is None else element.control_count)
 
     @cached_property
     def children(self) -> tuple[tuple[DividedTile, FloatArray], ...]:

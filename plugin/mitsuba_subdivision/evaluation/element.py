@@ -165,8 +165,7 @@ def _times_points(weights: list[FloatArray], points: list[FloatArray]) -> FloatA
 def _chosen(points: list[FloatArray], located: LocatedSamples, which: IntArray) -> list[FloatArray]:
     """Select the control points ``(m, K, x)`` of the samples ``which``, in increasing order, for each element."""
     slices = [*located.slices()]
-    ends = np.searchsorted(which, [samples.stop for samples in slices])
-    split = np.split(which, ends[:-1])
+    split = np.split(which, np.searchsorted(which, [samples.stop for samples in slices])[:-1])
     return [p[chosen - samples.start] for p, chosen, samples in zip(points, split, slices, strict=True)]
 
 

@@ -15,17 +15,8 @@ from ..mesh.connectivity import IntArray
 from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray, ParameterMap
 from ..schemes.scheme import Scheme, SchemeError
+from . import equations
 from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, EigenbasisError, eigenbasis
-from .equations import (
-    AT_EXTRAORDINARY_POINT,
-    Evaluator,
-    SampleRows,
-    child_rows,
-    power_rows,
-    stabilized_rows,
-    stam_rows,
-    times_powers,
-)
 from .normals import limit_frame, uneven_frame
 from .polynomials import polynomial_basis
 
@@ -85,7 +76,7 @@ class IrregularPatch:
         """``(2, K)`` float64, over the eigen-coordinates: tangents at the point along ``v = 0`` and ``u = 0``."""
         # The characteristic map at (1, 0) and (0, 1) gives the directions of the two edges.
         scheme = self.scheme
-        _, ends = child_rows(scheme, scheme.domain.corners[[1, -1]], self.eigen_children[:, :, 1:3], 1)
+        _, ends = equations.child_rows(scheme, scheme.domain.corners[[1, -1]], self.eigen_children[:, :, 1:3], 1)
         ends = ends[0]
         if np.linalg.det(ends) <= PARALLEL * np.abs(ends).max() ** 2:
             # The tangents of straight opposite edges (valence 2) span no plane, but the frame does.
@@ -97,8 +88,7 @@ class IrregularPatch:
     @property
     def has_own_frame(self) -> bool:
         """Whether normals need a frame in place of the derivatives: on borders, creases, and at sharp vertices."""
-        is_inside = self.signature.fans[0].is_inside
-        return not is_inside or self.contracts_unevenly or self.basis.eigenvalues[2] < 0
+        return not self.signature.fans[0].is_inside or self.contracts_unevenly or self.basis.eigenvalues[2] < 0
 
     @property
     def contracts_unevenly(self) -> bool:
@@ -108,42 +98,44 @@ class IrregularPatch:
     def rows(
         self,
         uv: FloatArray,  # (s, 2) float64
-        evaluator: Evaluator,
+        evaluator: equations.Evaluator,
         dtype: DTypeLike,  # Type of all arithmetic after the child's parameters
         derivatives: int = 1,
-    ) -> SampleRows:
+    ) -> equations.SampleRows:
         """Compute coefficients of samples over the eigen-coordinates ``V⁻¹ C``, or for "power" the control points.
 
         At the extraordinary point itself, (4), (9) and second derivatives are undefined: NaN.
         """
         tables = self.children if evaluator == "power" else self.eigen_children
-        level, rows = child_rows(self.scheme, uv, tables.astype(dtype, copy=False), derivatives)
+        level, rows = equations.child_rows(self.scheme, uv, tables.astype(dtype, copy=False), derivatives)
         at_point = (self.scheme.domain.extent(uv) == 0) | (evaluator == "limit")
         scale, frame = np.ones((2, len(uv)), dtype=dtype), None
         # At levels beyond the resolution of their precision, the published forms and the derivative scale overflow.
         with np.errstate(over="ignore", invalid="ignore"):
             if evaluator == "power":
-                rows = power_rows(rows, level, self.matrix)
+                rows = equations.power_rows(rows, level, self.matrix)
             elif evaluator == "stam":
-                rows = stam_rows(rows, level, self.basis)
+                rows = equations.stam_rows(rows, level, self.basis)
             else:
                 uneven = uneven_frame(rows[1:3], level, self.basis) if self.contracts_unevenly else None
-                rows, scale = stabilized_rows(rows, level, self.basis)
+                rows, scale = equations.stabilized_rows(rows, level, self.basis)
                 if self.has_own_frame:
                     frame = rows[1:3].copy() if uneven is None else uneven
                     frame[:, at_point] = self.limit_frame[:, None]
         rows[:, at_point], scale[:, at_point] = np.nan, 1
         if evaluator in ("stabilized", "limit"):
             rows[0, at_point], rows[1:3, at_point] = np.eye(1, rows.shape[2])[0], self.edge_tangents[:, None]
-        level = np.where(at_point, AT_EXTRAORDINARY_POINT, level)
-        return SampleRows(rows, scale, level, rows[1:3] if frame is None else frame, have_frame=frame is not None)
+        level = np.where(at_point, equations.AT_EXTRAORDINARY_POINT, level)
+        return equations.SampleRows(
+            rows, scale, level, rows[1:3] if frame is None else frame, have_frame=frame is not None
+        )
 
 
 def level_polynomials(patch: IrregularPatch, form: FloatArray, levels: NDArray[np.int64]) -> FloatArray:
     """Return ``(l, 3, m, K)`` coefficients of levels' regular pieces over eigen-coordinates, by ``form`` ``(m, R)``."""
     rows: FloatArray = form @ patch.eigen_children
     flat = np.repeat(rows.reshape(-1, 1, rows.shape[2]), len(levels), axis=1)
-    powers = times_powers(flat, levels, patch.basis, 1.0).reshape(*rows.shape[:2], len(levels), rows.shape[2])
+    powers = equations.times_powers(flat, levels, patch.basis, 1.0).reshape(*rows.shape[:2], len(levels), rows.shape[2])
     # The first eigenvector is one, whose coefficients are whole numbers.
     powers[..., 0] = np.rint(form.sum(axis=1))[:, None]
     return np.moveaxis(powers, 2, 0)

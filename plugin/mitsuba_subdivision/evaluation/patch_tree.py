@@ -70,8 +70,7 @@ class PatchTree:
             patch = irregular_patch(scheme, signature.rotated(corner))
             if patch is not None:
                 order = rotation_order(signature, corner)
-                domain = scheme.domain.rotation(corner).inverse()
-                return Piece(domain, np.eye(len(order))[order[patch.slots]], patch)
+                return Piece(scheme.domain.rotation(corner).inverse(), np.eye(len(order))[order[patch.slots]], patch)
         return None
 
     @cached_property

@@ -70,8 +70,7 @@ def sector(points: FloatArray, index: int, valence: int) -> FloatArray:
 
 def outline(corners: NDArray[np.floating]) -> NDArray[np.float64]:
     """Points along the sides of a polygon ``(m, 2)``, `SIDE_POINTS` on each."""
-    sides = np.linspace(corners, np.roll(corners, -1, axis=0), SIDE_POINTS, endpoint=False, axis=1)
-    return sides.reshape(-1, 2)
+    return np.linspace(corners, np.roll(corners, -1, axis=0), SIDE_POINTS, endpoint=False, axis=1).reshape(-1, 2)
 
 
 def sub_domain(domain: ParameterDomain, level: int, child: int) -> NDArray[np.float64]:
@@ -189,8 +188,7 @@ def draw_tree(options: FigureOptions) -> list[Path]:
     around = outline(scheme.domain.corners)
     coloured = [(domain, LEAF_COLOURS[level]) for domain, level, _ in leaves] + [(rest, REST) for rest in rests]
     for domain, colour in coloured:
-        corners = image(np.clip(domain(around), 0, 1))
-        face.fill(*corners.T, facecolor=colour, edgecolor=LINE, linewidth=0.4, zorder=2)
+        face.fill(*image(np.clip(domain(around), 0, 1)).T, facecolor=colour, edgecolor=LINE, linewidth=0.4, zorder=2)
     face.plot(*image(np.stack([rest.offset for rest in rests])).T, "o", color="#c8432b", markersize=4, zorder=5)
     hide_frame(face)
     colours = f"$K$ = {count} control points\ngrey: (10) and (12); red: (13)"

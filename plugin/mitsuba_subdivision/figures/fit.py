@@ -171,7 +171,6 @@ def _fit_cage(refine: list[int], views: list[View]) -> Course:
 
 
 def _fit_mesh(views: list[View]) -> Course:
-    """Fit a dense mesh of triangles in the same way."""
     ball = ball_cage(DENSE, RADIUS)
     mesh = ControlCage(ball.positions, ball.triangles)
     shape = make_mesh(mesh.positions, ball.triangles, GREY)
@@ -210,8 +209,7 @@ def _fit_creases() -> tuple[list[Box], NDArray[np.float64]]:
 
     def box(sides: tuple[float, float, float], sharpness: NDArray[np.float64]) -> ControlCage:
         positions = SIDE / 2 * np.array(sides) * cube().positions
-        creases = np.column_stack([edges, sharpness])
-        return ControlCage(positions, cube().face_vertices.reshape(-1, 4), creases=creases)
+        return ControlCage(positions, cube().face_vertices.reshape(-1, 4), creases=np.column_stack([edges, sharpness]))
 
     start, target = box((1, 1, 1), sharpness[0]), box(SIDES, truth)
     fit = CageFit(
@@ -293,8 +291,7 @@ def _plot_courses(losses: Axes, chamfer: Axes, shape: ControlCage, courses: Mapp
         losses.loglog(VIEWS * (1 + np.arange(STEPS)), 1e3 * np.array(course), color=colour)
         steps, cages = zip(*list(fitted.items())[1:], strict=True)
         label = f"{LABELS[name]}, {cages[-1].vertex_count:,} points"
-        values = 100 * distances(shape, cages)
-        chamfer.loglog(VIEWS * np.array(steps), values, marker=marker, color=colour, label=label)
+        chamfer.loglog(VIEWS * np.array(steps), 100 * distances(shape, cages), marker=marker, color=colour, label=label)
     _finish(losses, "loss (thousandths)", is_logarithmic=True)
     _finish(chamfer, "distance (%)", is_logarithmic=True)
 

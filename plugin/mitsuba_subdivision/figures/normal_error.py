@@ -45,13 +45,10 @@ TURNS = Rotation.random(20, random_state=19).as_matrix()  # Rotations of the fig
 # 0.41 and 0.55 (Catmull-Clark), 0.25 and 0.45 (Loop), 0.5 (Doo-Sabin). For smaller ones, samples of the same u and v
 # are closer to the point. The rates make triangles there about equally large.
 ROWS = {
-    ("catmull_clark", 3): (1e-6, 3),
-    ("catmull_clark", 5): (1e-8, 4),
-    ("loop", 3): (1e-4, 2),
-    ("loop", 5): (1e-7, 4),
-    ("doo_sabin", 3): (1e-7, 4),
-    ("doo_sabin", 5): (1e-7, 4),
-}
+    ("catmull_clark", 3): (1e-6, 3), ("catmull_clark", 5): (1e-8, 4),
+    ("loop", 3): (1e-4, 2), ("loop", 5): (1e-7, 4),
+    ("doo_sabin", 3): (1e-7, 4), ("doo_sabin", 5): (1e-7, 4),
+}  # fmt: skip
 # Title, evaluator, and whether samples lie beside the extraordinary point; all in float32.
 RULES: tuple[tuple[str, Evaluator, bool], ...] = (
     ("Stam's form (11)", "stam", True),
@@ -142,8 +139,7 @@ def _lost_at(cage: ControlCage) -> float:
 
 
 def _draw_lines(axis: Axes, sensor: mi.Sensor, surface: LimitSurface, mesh: Tessellation, to_world: FloatArray) -> None:
-    distance = np.linalg.norm(mesh.positions - mesh.positions[0], axis=1)
-    near = np.flatnonzero(distance < NEEDLE_RADIUS)
+    near = np.flatnonzero(np.linalg.norm(mesh.positions - mesh.positions[0], axis=1) < NEEDLE_RADIUS)
     start = mesh.positions[near].astype(np.float64)
     needles = np.stack([start, start + NEEDLE_LENGTH * mesh.normals[near]], axis=1)
     edges = edge_curves(surface, np.arange(surface.patches.elements.half_edge_count), 16)
@@ -227,8 +223,7 @@ def normal_errors(cage: ControlCage, exact: FloatArray, evaluator: Evaluator, dt
     uv = (np.ldexp(1.0, -LEVELS)[:, None, None] * DIRECTIONS).reshape(-1, 2)
     normals = LimitSurface(cage).evaluate(0, uv, evaluator=evaluator, dtype=dtype).n.astype(np.float64)
     # Parallel or zero derivatives give no normal, which counts as the largest error.
-    angle = np.nan_to_num(normal_angle(normals, exact), nan=180)
-    return angle.reshape(len(LEVELS), -1).max(axis=1)
+    return np.nan_to_num(normal_angle(normals, exact), nan=180).reshape(len(LEVELS), -1).max(axis=1)
 
 
 def exact_normals(cage: ControlCage) -> NDArray[np.float64]:

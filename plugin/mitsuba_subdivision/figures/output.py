@@ -32,27 +32,16 @@ TEXT_SIZES = (6.0, 7.0)
 # Colours and markers of series, distinct in greyscale and for colour blindness; red marks extraordinary points only.
 SERIES = (("#2f8f83", "s"), ("#12395c", "o"), ("#d9a53f", "^"))
 STYLE: dict[Any, Any] = {
-    "pdf.fonttype": 42,
-    "mathtext.fontset": "dejavusans",
-    "axes.titlesize": "medium",
-    "axes.titleweight": "bold",
-    "axes.titlepad": 3,
-    "axes.labelsize": "medium",
-    "axes.labelpad": 2,
-    "axes.linewidth": 0.5,
-    "xtick.labelsize": "medium",
-    "ytick.labelsize": "medium",
-    "legend.fontsize": "medium",
-    "legend.frameon": False,
-    "grid.color": "0.88",
-    "grid.linewidth": 0.4,
-    "lines.linewidth": 1,
-    "lines.markersize": 3,
-    "figure.constrained_layout.w_pad": 0.015,
-    "figure.constrained_layout.h_pad": 0.025,
-    "figure.constrained_layout.wspace": 0.01,
-    "figure.constrained_layout.hspace": 0.01,
-}
+    "pdf.fonttype": 42, "mathtext.fontset": "dejavusans",
+    "axes.titlesize": "medium", "axes.titleweight": "bold", "axes.titlepad": 3, "axes.labelsize": "medium",
+    "axes.labelpad": 2, "axes.linewidth": 0.5,
+    "xtick.labelsize": "medium", "ytick.labelsize": "medium",
+    "legend.fontsize": "medium", "legend.frameon": False,
+    "grid.color": "0.88", "grid.linewidth": 0.4,
+    "lines.linewidth": 1, "lines.markersize": 3,
+    "figure.constrained_layout.w_pad": 0.015, "figure.constrained_layout.h_pad": 0.025,
+    "figure.constrained_layout.wspace": 0.01, "figure.constrained_layout.hspace": 0.01,
+}  # fmt: skip
 _EXPONENTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 

@@ -108,8 +108,7 @@ def in_8_bits(pixels: NDArray[np.float32]) -> NDArray[np.uint8]:
 
 def paint(colour: str | tuple[float, float, float]) -> SceneNode:
     """Diffuse material of an sRGB colour."""
-    linear = decoded(np.array(to_rgb(colour)))
-    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": linear.tolist()}}
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": decoded(np.array(to_rgb(colour))).tolist()}}
 
 
 def edge_rods(

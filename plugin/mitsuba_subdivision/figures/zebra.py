@@ -35,9 +35,8 @@ CORNER_FACE, CORNER = 1, 2  # Face of `cube`, and its corner, in the close-up
 NORMAL_RAYS = 5
 OPENSUBDIV_LEVEL = 2  # OpenSubdiv's own default for surfaces of single faces (Bfr)
 MIRROR = {"type": "conductor", "material": "none"}
-# Colours in sRGB: of bands in the wrong place, and of the rings around the corner.
-WRONG = np.array([240, 90, 30])
-RING = "#0a84c6"
+WRONG = np.array([240, 90, 30])  # Colour in sRGB of bands in the wrong place
+RING = "#0a84c6"  # Colour of the rings around the corner
 
 
 def draw_zebra(options: FigureOptions) -> list[Path]:

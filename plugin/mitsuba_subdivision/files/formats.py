@@ -87,8 +87,7 @@ def write_file(contents: CageContents, path: str | Path) -> None:
 
 def is_usd(path: Path) -> bool:
     """Whether a file may contain several meshes, and values at several times."""
-    known = FORMATS.get(path.suffix.lower())
-    return known is not None and known.has_prims
+    return path.suffix.lower() in FORMATS and FORMATS[path.suffix.lower()].has_prims
 
 
 def require_triangle_format(path: str | Path) -> str:

@@ -91,8 +91,7 @@ def read_obj(path: str | Path) -> CageContents:
         # Negative indices count backwards from the face's statement.
         above = np.repeat(np.cumsum(counted)[is_face], sizes)[rows]
         absolute = np.where(indices > 0, indices - 1, indices + above)
-        wrong = np.flatnonzero((indices == 0) | (absolute < 0) | (absolute >= count))[:1]
-        for k in wrong:
+        for k in np.flatnonzero((indices == 0) | (absolute < 0) | (absolute >= count))[:1]:
             expected = f"1 to {count} (the file has {count} {nouns[1]})"
             if indices[k] < 0:
                 expected = f"-{above[k]} to -1 ({above[k]} {nouns[1]} are above this line)"

@@ -153,7 +153,6 @@ def _materials(numbers: NDArray) -> dict[str, IntArray]:
 
 
 def _vertex_data(data: NDArray, numbers: Sequence[str]) -> tuple[Attribute | None, dict[str, Attribute]]:
-    """Texture coordinates and attributes among the numeric properties."""
     names = [name for name in numbers if name not in (*_POSITION, *_NORMAL)]
     pair = next((pair for pair in _TEXCOORDS if set(pair) <= set(names)), ())
     names = [name for name in names if name not in pair]

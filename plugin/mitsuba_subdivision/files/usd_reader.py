@@ -141,7 +141,6 @@ class MeshReader:
             return otherwise
 
     def _tell(self, message: str, path: object) -> None:
-        """Report a message about a prim or an attribute; by default, as a `CageWarning`."""
         if self._report is None:
             warn(message)
         else:
@@ -246,8 +245,6 @@ class MeshReader:
         """Rows (vertex, sharpness)."""
         indices = self.array(self.mesh.GetCornerIndicesAttr(), np.int64)
         sharpness = self.array(self.mesh.GetCornerSharpnessesAttr(), np.float64)
-        if not len(indices) and not len(sharpness):
-            return np.zeros((0, 2))
         if len(indices) != len(sharpness):
             problem = f"cornerSharpnesses has {len(sharpness)} entries, but cornerIndices has {len(indices)}"
             raise self.error(problem, "as many")

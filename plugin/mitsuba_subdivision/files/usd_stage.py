@@ -123,7 +123,6 @@ def _warn_of_no_effect(name: str, layer: Sdf.Layer, stage: Usd.Stage) -> None:
 
 
 def _warn_of_missing(name: str, errors: list[str]) -> None:
-    """Warn of referenced assets that could not be opened, in one line for each kind."""
     if documents := [match[1] for match in map(_MATERIALX.search, errors) if match]:
         files = _listed(sorted({os.path.basename(document) for document in documents}), 3)
         count = f"{len(documents)} references" if len(documents) > 1 else "a reference"

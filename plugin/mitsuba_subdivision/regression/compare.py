@@ -22,8 +22,7 @@ class WorstPixel:
     y: int
     x: int
     shown_by: str  # The tier that chose the pixel; "z-score" or "difference" where no tier failed or warned
-    # The pixel's values; those of the first batch if the paired tier chose it
-    reference: tuple[float, ...]
+    reference: tuple[float, ...]  # The pixel's values; those of the first batch if the paired tier chose it
     test: tuple[float, ...]
     names: tuple[str, ...] = RGB  # R, G, B and other differing channels
     surface: str | None = None  # First hit of the ray through the pixel, by the reference's probe, or else the test's
@@ -205,8 +204,7 @@ def _decide(
     if chosen is None and all(result.status is Status.SKIPPED for name, result in results.items() if name != "probe"):
         results["flip"] = compared("flip")
     for result in results.values():
-        cannot_run = result.status is Status.SKIPPED and not (result is paired and is_replaced)
-        if cannot_run and result.name in (chosen or ()):
+        if result.status is Status.SKIPPED and not (result is paired and is_replaced) and result.name in (chosen or ()):
             raise RegressionError(f'tier "{result.name}" cannot run: {result.lines[0]}')
     tiles, probe = results.get("tile"), results.get("probe")
     same = paired and paired.numbers.get("changed_pixels") == 0 and probe and probe.status is Status.PASS

@@ -168,8 +168,7 @@ def _joined(ordered: Sequence[Image]) -> list[list[int]]:
 def probe_scene(loaded: LoadedScene) -> Probe:
     """The first hits of the rays through the centres of pixels."""
     width, height = loaded.size
-    # Any, as the stubs are for variants with arrays.
-    sensor: Any = loaded.sensor
+    sensor: Any = loaded.sensor  # Any, as the stubs are for variants with arrays
     scene: Any = loaded.scene
 
     def first_hit(x: Any, y: Any) -> Any:
@@ -205,9 +204,8 @@ def probe_scene(loaded: LoadedScene) -> Probe:
     return Probe(position, normal, uv, shape, triangle, element)
 
 
-# Samples per pixel: four batches for a test, and 64 times as many for a reference.
-TEST_SPP = 256
-REFERENCE_SPP = 16384
+TEST_SPP = 256  # Samples per pixel of a test: four batches
+REFERENCE_SPP = 16384  # Samples per pixel of a reference, 64 times as many
 SEED_STEP = 2**20  # Distance between the seeds of references, tests and second attempts, whose samples differ
 RETRY_FACTOR = 4  # Samples of the second attempt, relative to the first
 

@@ -122,7 +122,6 @@ def _maps(comparison: Comparison) -> dict[str, NDArray[np.floating]]:
 
 
 def _draw_map(panel: Axes, comparison: Comparison, name: str, values: NDArray[np.floating]) -> None:
-    """Draw a map with its colour bar, grey where it has no value."""
     import matplotlib
     from matplotlib.colors import LogNorm, Normalize
     from matplotlib.patches import Rectangle

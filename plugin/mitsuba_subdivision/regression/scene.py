@@ -205,8 +205,7 @@ def render_parts(
 
 def render_image(loaded: LoadedScene, spp: int, seed: int = 0) -> NDArray[np.float32]:
     """Render with all channels: many samples in parts if the sampler is "independent"; else by one `mi.render`."""
-    is_independent = str(loaded.sensor.sampler()).startswith("IndependentSampler")
-    parts = parts_of(spp, loaded.size) if is_independent else [spp]
+    parts = parts_of(spp, loaded.size) if str(loaded.sensor.sampler()).startswith("IndependentSampler") else [spp]
     return render_parts(loaded.scene, parts, seed, sensor=loaded.sensor_index)
 
 

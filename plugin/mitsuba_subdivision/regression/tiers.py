@@ -77,9 +77,8 @@ class Tolerances:
     """
 
     mask_fraction: float = 1e-3  # Share of pixels that may show another shape or element, or a hit in one image only
-    # Degrees between shading normals away from silhouettes: 99.9th percentile and maximum
-    angle_p999: float = 0.002
-    angle_max: float = 0.01
+    angle_p999: float = 0.002  # Degrees between shading normals away from silhouettes, 99.9th percentile
+    angle_max: float = 0.01  # Their maximum
     position: float = 5e-6  # Distance of hit points, in diagonals of the bounding box of all hit points
     uv_p999: float = 1e-3  # Difference of parameters where the same triangle is hit, 99.9th percentile
     paired_relative: float = 1e-5  # Relative difference of pixels with the same samples; 0 demands equal bits
@@ -87,9 +86,8 @@ class Tolerances:
     # Addition to the standard error of a tile for sums in single precision: relative to its mean, and in radiance
     floor_relative: float = 2e-4
     floor_absolute: float = 1e-6
-    # Mean and 95th percentile of FLIP
-    flip_mean: float = 0.005
-    flip_p95: float = 0.02
+    flip_mean: float = 0.005  # Mean of FLIP
+    flip_p95: float = 0.02  # 95th percentile of FLIP
 
     def with_values(self, values: Mapping[str, Any]) -> Tolerances:
         """Replace some limits. Raises RegressionError for an unknown name, or a negative or non-finite value."""

@@ -16,20 +16,9 @@ from .scheme import (
 )
 
 __all__ = [
-    "BUILT_IN",
-    "CatmullClark",
-    "DooSabin",
-    "Loop",
-    "PhantomPoint",
-    "Refinement",
-    "Scheme",
-    "SchemeError",
-    "StencilTable",
-    "Unsupported",
-    "register_scheme",
-    "scheme_named",
-    "with_rules",
-]
+    "BUILT_IN", "CatmullClark", "DooSabin", "Loop", "PhantomPoint", "Refinement", "Scheme", "SchemeError",
+    "StencilTable", "Unsupported", "register_scheme", "scheme_named", "with_rules",
+]  # fmt: skip
 
 BUILT_IN = tuple(kind.name for kind in (CatmullClark, DooSabin, Loop))  # Names of the schemes of this package
 for _kind in (CatmullClark, DooSabin, Loop):

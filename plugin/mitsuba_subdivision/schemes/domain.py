@@ -82,8 +82,7 @@ class ParameterDomain:
         """Return the map from parameters with (0, 0) at corner ``corner`` to parameters with (0, 0) at corner 0."""
         start = self.corners[corner]
         along_u = self.corners[(corner + 1) % self.corner_count] - start
-        along_v = self.corners[corner - 1] - start
-        return ParameterMap(np.stack([along_u, along_v], axis=1), start)
+        return ParameterMap(np.stack([along_u, self.corners[corner - 1] - start], axis=1), start)
 
     def inside(self, uv: FloatArray) -> FloatArray:
         """Return ``(s,)`` depth of parameters: positive inside the domain, zero on its edges, negative outside."""

@@ -84,8 +84,7 @@ def _parsed(library: Path, text: str) -> dict[str, Material]:
         elif key and key not in _WITHOUT_EFFECT:
             left_out[key] = None
     if left_out:
-        names = shortened(", ".join(left_out), 200)
-        warn(f'"{library}": {names} left out; expected {_EXPECTED}')
+        warn(f'"{library}": {shortened(", ".join(left_out), 200)} left out; expected {_EXPECTED}')
     return materials
 
 

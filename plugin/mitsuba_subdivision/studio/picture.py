@@ -78,8 +78,7 @@ def highest_rate(
 ) -> int:
     """Largest rate, up to `FINEST_RATE`, with at most `MOST_TRIANGLES` of all cages."""
     # A quadrilateral has four corners, and two triangles for each square of the rate.
-    rates = np.arange(2, FINEST_RATE + 1)
-    triangles = (np.minimum(segments, rates[:, None]) ** 2 * corners).sum(axis=1) // 2
+    triangles = (np.minimum(segments, np.arange(2, FINEST_RATE + 1)[:, None]) ** 2 * corners).sum(axis=1) // 2
     return 1 + int(np.searchsorted(triangles, MOST_TRIANGLES, side="right"))
 
 
@@ -237,8 +236,7 @@ def render_denoised(
     """
     require_denoiser()
     loaded = load_scene(scene, parameters, BOX)
-    pixels = render_image(loaded, spp or loaded.sensor.sampler().sample_count(), seed)
-    return denoised(loaded, pixels, seed)
+    return denoised(loaded, render_image(loaded, spp or loaded.sensor.sampler().sample_count(), seed), seed)
 
 
 def denoised(loaded: LoadedScene, pixels: NDArray[np.float32], seed: int = 0) -> NDArray[np.float32]:

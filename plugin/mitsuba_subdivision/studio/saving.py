@@ -57,8 +57,7 @@ def save_scene(
         name: parts.in_files(name, dict(entry)) if isinstance(entry, Mapping) else entry
         for name, entry in scene.items()
     }
-    config = mi.parser.ParserConfig(str(mi.variant()))
-    text = _as_text(mi.parser.parse_dict(config, entries))
+    text = _as_text(mi.parser.parse_dict(mi.parser.ParserConfig(str(mi.variant())), entries))
     written = parts.write()
     write_text(path, f'<?xml version="1.0"?>\n{text}')
     return [*written, path]
@@ -81,8 +80,7 @@ def _as_text(state: mi.parser.ParserState) -> str:
     def shortened(tag: re.Match[str]) -> str:
         return _NUMBER.sub(lambda match: _short(float(match[0])), tag[0])
 
-    text = _NUMBERS.sub(shortened, mi.parser.write_string(state))
-    return _TRANSFORM.sub(placed, text)
+    return _TRANSFORM.sub(placed, _NUMBERS.sub(shortened, mi.parser.write_string(state)))
 
 
 def _steps(matrix: NDArray[np.float64]) -> list[str]:
@@ -146,7 +144,6 @@ class _SceneParts:
         return entry
 
     def write(self) -> list[Path]:
-        """Write the files of all entries, and return their paths."""
         for path, write in self._writers.items():
             write(path)
         return list(self._writers)

@@ -21,12 +21,8 @@ from ..variants import SceneNode
 
 # Azimuth and elevation in degrees. Azimuth 0 is the model's front, 90 its own left, which is +x.
 VIEWS = {
-    "front": (0.0, 0.0),
-    "side": (90.0, 0.0),
-    "back": (180.0, 0.0),
-    "top": (0.0, 90.0),
-    "three-quarter": (35.0, 18.0),
-}
+    "front": (0.0, 0.0), "side": (90.0, 0.0), "back": (180.0, 0.0), "top": (0.0, 90.0), "three-quarter": (35.0, 18.0),
+}  # fmt: skip
 DEFAULT_VIEW = "three-quarter"
 UP_AXES = ("y", "z")
 View = str | Sequence[float]
@@ -167,9 +163,8 @@ def studio(
 
 def finished(scene: SceneNode, look: Look, up: str) -> SceneNode:
     """A scene with the environment, AOVs and background of a look."""
-    left: tuple[str, ...] = ("ground",) if look.transparent else ()
-    if look.environment is not None or not look.has_studio:
-        left = STUDIO
+    has_backdrop = look.environment is None and look.has_studio
+    left: tuple[str, ...] = ("ground",) * look.transparent if has_backdrop else STUDIO
     scene = {name: entry for name, entry in scene.items() if name not in left}
     if look.environment is not None:
         to_world = _transform(studio_axes(up) @ turned(look.turn) @ studio_axes("y").T, np.zeros(3))
