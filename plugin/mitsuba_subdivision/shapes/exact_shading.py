@@ -175,7 +175,14 @@ class ExactShading:
         to_world, direction = self._map, self._direction(si, wi)
         start = self._located(si.prim_index, 1 / 3, 1 / 3, active)
         hit = to_world.inverse_point(vector3(dr.detach(si.p)))
-        location, kind, _ = self.kernel.line_hits(hit, to_world.inverse_direction(direction), start, active)
+
+        def found(direction: Vector3, active: Mask) -> tuple[Location, Index]:
+            # As for the interaction: near outlines, the line soon leaves the surface again.
+            side = dot(vector3(dr.detach(si.n)), direction) * self._sign
+            limits = {"wanted_sign": side}
+            return self.kernel.line_hits(hit, self._map.inverse_direction(direction), start, active, **limits)[:2]
+
+        location, kind = found(direction, active)
         shape = self._shape()
         if shape is None or int(shape.bsdf().flags()) & int(mi.BSDFFlags.BackSide):
             # Where `twosided` has swapped front and back, intersect the mirrored ray.
@@ -186,7 +193,7 @@ class ExactShading:
                 if self._texcoords is not None:
                     u, v = self._texcoords(location, active)[0]
             is_mirrored = active & (dr.maximum(dr.abs(u - si.uv.x), dr.abs(v - si.uv.y)) > SAME_PARAMETERS)
-            at_mirrored = self.kernel.line_hits(hit, to_world.inverse_direction(mirrored), start, is_mirrored)
+            at_mirrored = found(mirrored, is_mirrored)
             location, kind = location.chosen(is_mirrored, at_mirrored[0]), dr.select(is_mirrored, at_mirrored[1], kind)
             direction = dr.select(is_mirrored, mirrored, direction)
         if dr.grad_enabled(si.p):
