@@ -58,6 +58,7 @@ class ExactShading:
         name: str,  # Name of the cage in messages
         kernel: SurfaceKernel,  # The surface in object space, relative to the centre of the placement
         channels: dict[str, ChannelKernel],  # See `channels_at_hits`
+        placement: Placement,
         triangles: Triangles,
     ) -> None:
         self._variant, self._name, self.kernel, self.channels = variant, name, kernel, channels
@@ -71,6 +72,7 @@ class ExactShading:
         sizes = {name: channel.values.size for name, channel in self._attributes.items()}
         self._upsampling = spectral_upsampling(variant, sizes)
         self.to_world: Matrix4 = kernel.types.matrix4(1)  # For points relative to the centre
+        self.update(placement.matrix, placement)
         self.retessellate(triangles)
 
     def retessellate(self, triangles: Triangles) -> None:

@@ -106,7 +106,8 @@ def make_subdivision(
                 from .exact_shading import ExactShading
                 from .interaction_hook import interaction_hook
 
-                self._exact = ExactShading(variant, self, surface.cage.source.name, on_device, channels, triangles)
+                shown = channels, self._placement, triangles
+                self._exact = ExactShading(variant, self, surface.cage.source.name, on_device, *shown)
                 interaction_hook(variant).attach(self, self._exact)
             attributes = mesh_attributes(surface.cage)
             exposed = [name for name in (TEXCOORDS, *attributes) if name in surface.attribute_names]
