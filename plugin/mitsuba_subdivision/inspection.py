@@ -22,8 +22,7 @@ from .surface import LimitSurface
 # refinement that they outlast.
 MANY_CLASSES = 1000
 HIGH_VALENCE = 12  # Higher valences are visible in renders as a pinch
-# Bytes of a mesh in single precision: position and normal of a vertex; texture coordinates; vertices and element of a
-# triangle.
+# Bytes in single precision: position and normal of a vertex; texture coordinates; vertices and element of a triangle.
 VERTEX_BYTES, TEXCOORD_BYTES, TRIANGLE_BYTES = 24, 8, 16
 
 

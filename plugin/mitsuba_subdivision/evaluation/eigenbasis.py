@@ -39,8 +39,7 @@ class Eigenbasis:
     # (K,) float64: one for each column of V; in a block, the mean of the real parts of its eigenvalues
     eigenvalues: FloatArray
     moduli: FloatArray  # (K,) float64: the modulus of each eigenvalue; in a block, the largest modulus
-    # tuple of (slice, (m, m) float64): the blocks of T that are not multiples of the identity, with the slice of their
-    # rows and columns
+    # tuple of (slice, (m, m) float64): blocks of T other than multiples of the identity, with their rows and columns
     blocks: tuple[tuple[slice, FloatArray], ...]
 
     @property

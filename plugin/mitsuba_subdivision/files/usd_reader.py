@@ -37,8 +37,7 @@ def read_usd(
     """Read a mesh of a USD file, or all meshes, with subdivision attributes and primvars, in world space.
 
     ``prim``, ``time``, errors and warnings are those of `ControlCage.from_file`; the cage is not validated. Faces of
-    left-handed and mirrored meshes are reversed, to be counter-clockwise from outside. Skeletons and blend shapes move
-    the points.
+    left-handed and mirrored meshes become counter-clockwise from outside. Skeletons and blend shapes move the points.
     """
     name = f'"{path}"'
     if time is not None and not math.isfinite(time):

@@ -133,14 +133,12 @@ def weigh_lights(scene: mi.Scene, sensor: int = 0) -> bool:
     """Set the ``sampling_weight`` of lights to their contributions to a picture, which stays unbiased.
 
     Mitsuba samples all lights with equal probability. Here, the direct light of each is rendered with a few rays; no
-    weight is below 0.03 of the sum. Equal probabilities spread samples evenly over a pixel, so weights help for uneven
-    lights only.
+    weight is below 0.03 of the sum. Equal probabilities spread samples evenly over pixels: weights help uneven lights.
 
     Parameters
     ----------
     scene : mi.Scene
-        Its lights are changed, unless they are fewer than 3, nearly equal or already weighted, or the variant is
-        scalar.
+        Its lights are changed, unless they are fewer than 3, nearly equal or weighted, or the variant is scalar.
     sensor : int
         The sensor of the picture.
 

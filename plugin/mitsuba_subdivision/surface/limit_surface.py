@@ -247,8 +247,7 @@ class LimitSurface:
         """Area of the surface, in squared units of the cage's space.
 
         Computed by Gauss quadrature of every polynomial piece, at all levels around extraordinary points, to a relative
-        accuracy of 1e-12; where the surface is folded along a curve inside an element, to about 1e-8 of the pieces
-        there.
+        accuracy of 1e-12; where it is folded along a curve inside an element, to about 1e-8 of the pieces there.
 
         Raises
         ------
@@ -302,8 +301,7 @@ class LimitSurface:
         Returns
         -------
         (n_v, n_v) CSR array of float64
-            Symmetric, positive semi-definite. Constants are in its null space; for a flat surface, so are its
-            coordinates.
+            Symmetric, positive semi-definite. Constants are in its null space, and coordinates of a flat surface.
 
         Raises
         ------
