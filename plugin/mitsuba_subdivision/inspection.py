@@ -18,8 +18,7 @@ from .mesh.connectivity import IntArray, Topology, VertexRule
 from .mesh.cuts import seams
 from .surface import LimitSurface
 
-# Number of classes of patches above which their weights dominate the time. Semi-sharp features count once for each
-# refinement that they outlast.
+# Classes of patches above which their weights dominate the time; semi-sharp ones count once for each refinement.
 MANY_CLASSES = 1000
 HIGH_VALENCE = 12  # Higher valences are visible in renders as a pinch
 # Bytes in single precision: position and normal of a vertex; texture coordinates; vertices and element of a triangle.

@@ -30,8 +30,7 @@ class EigenbasisError(ArithmeticError):
 class Eigenbasis:
     """``A = V T L`` with ``L = V^-1``; T is diagonal except for the blocks of defective or complex eigenvalues.
 
-    Eigenvalues are sorted by decreasing modulus. All entries of column 0 of V are exactly one, so row 0 of L is the
-    limit stencil of the extraordinary point.
+    Moduli of eigenvalues decrease. Column 0 of V is exactly 1, so row 0 of L is the limit stencil of the point.
     """
 
     vectors: FloatArray  # (K, K) float64: V, right eigenvectors in columns

@@ -334,8 +334,7 @@ def parameter_extent(magnification: float) -> float:
 def panel_samples(surface: LimitSurface, magnification: float, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Samples of a grid of ``count`` segments along each side in a panel's part of every element at the point.
 
-    Returns parameters ``(s, 2)``, and positions on the stage and normals, ``(valence, s, 3)`` float64 each, as points
-    of the last panels coincide in float32.
+    Returns parameters ``(s, 2)``; positions on the stage and normals ``(valence, s, 3)``, too close for float32.
     """
     uv = staging.grid_points(np.linspace(0, 1, count + 1))
     uv[0] = 0.1 / count  # Stam's form has no value at the point itself

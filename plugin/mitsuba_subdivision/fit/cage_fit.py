@@ -114,8 +114,7 @@ class CageFit(Fit):
     sharp_edges : (n, 2) array of int, optional
         0-based ends of edges whose sharpness is fitted, too, from that in ``cage``. Refinement subtracts 1, down to 0.
     crease_of : (n,) array of int, optional
-        0-based crease of each of these edges. Edges of a crease have one sharpness, initially the mean. By default each
-        edge is a separate crease.
+        0-based crease of each of these edges, with one sharpness, initially the mean. By default each edge is a crease.
     highest_sharpness : int
         Upper bound of the sharpness, 1 to 6; refinement decreases it by one, down to 1. The shape's cage is refined as
         many times: see `UnknownCreases`.

@@ -206,9 +206,8 @@ def render_denoised(
 ) -> NDArray[np.float32]:
     """Render a scene with the box filter, and remove its noise by Open Image Denoise.
 
-    With a wider filter, noise of neighbouring pixels is correlated, and the denoiser keeps it. Albedo and normals of
-    the first hits preserve textures and edges. Denoised pictures are biased: do not compare them or use them as
-    references.
+    Wider filters correlate the noise of neighbouring pixels, and the denoiser keeps it. Albedo and normals of the first
+    hits preserve textures and edges. Denoised pictures are biased: do not compare them or use them as references.
 
     Parameters
     ----------

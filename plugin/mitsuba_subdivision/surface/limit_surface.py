@@ -205,8 +205,7 @@ class LimitSurface:
     def channel(self, name: str) -> Channel:
         """The interpolation of an attribute, or of the texture coordinates ("texcoords"), over the elements.
 
-        Repeated calls return the same object. Raises ValueError if the cage has no such attribute, and SchemeError if
-        the scheme has no rules for it.
+        Repeated calls return the same object. Raises ValueError without such an attribute, SchemeError without rules.
         """
         if name not in self._channels:
             attributes = attributes_by_name(self.cage.texcoords, self.cage.attributes)
@@ -344,8 +343,7 @@ class LimitSurface:
     def closest_point(self, points: ArrayLike) -> ClosestPoints:
         """Find the nearest point of the surface for each given point; where several are nearest, one of them.
 
-        The result is the global minimum of the distance. The first call prepares a search, which takes some
-        milliseconds for a hundred faces.
+        The distance is a global minimum. The first call prepares a search, in some milliseconds for a hundred faces.
 
         Parameters
         ----------
@@ -467,8 +465,7 @@ class LimitSurface:
         Warns
         -----
         CageWarning
-            If parts of the surface need more segments than ``max_rate`` for the criterion. A criterion for outlines
-            never warns.
+            If parts of the surface need more than ``max_rate`` segments, except by a criterion for outlines.
         """
         points, shape = self.cage.positions, self.cage.positions.shape
         if control_points is not None:
