@@ -13,7 +13,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from .cage import ControlCage
-from .cage.contents import RULES
+from .cage.contents import RULES, attributes_by_name
 from .mesh.connectivity import IntArray, Topology, VertexRule
 from .mesh.cuts import seams
 from .surface import LimitSurface
@@ -125,10 +125,9 @@ def _sharp_features(cage: ControlCage) -> dict[str, int]:
 
 def _attributes(cage: ControlCage) -> dict[str, str]:
     t, described = cage.topology, {}
-    for name, attribute in {"texcoords": cage.texcoords, **cage.attributes}.items():
-        if attribute is not None:
-            described[name] = attribute.interpolation.replace("_", "-")
-        if attribute is not None and attribute.indices is not None:
+    for name, attribute in attributes_by_name(cage.texcoords, cage.attributes).items():
+        described[name] = attribute.interpolation.replace("_", "-")
+        if attribute.indices is not None:
             count = np.count_nonzero(seams(t, attribute.indices)[t.edge_half_edge])
             described[name] += f" with {count:,} seam edges, rule {cage.face_varying}"
     return described

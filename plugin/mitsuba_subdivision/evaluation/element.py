@@ -107,8 +107,7 @@ def evaluate_samples(
         if derivatives == 2:
             values[3:] = _second_by_uv(values[3:], jacobian) * scale[1]
     normal: FloatArray = np.full((3, count), np.nan, dtype=dtype)
-    # Only points in space have normals, texture coordinates do not.
-    if len(extent) == 3:
+    if len(extent) == 3:  # Only points in space have normals, texture coordinates do not
         framed = np.flatnonzero(located.per_sample([np.full(len(r.level), r.have_frame) for r in rows]))
         if len(framed):
             framed_samples, framed_points = located.chosen(framed), _chosen(points, located, framed)

@@ -27,8 +27,7 @@ MOST_VERTICES = {"exact": 0.95, "vertex": 0.99}
 MOST_SEGMENTS, FINEST_RATE = 8, 64  # Most segments on each edge of a cage: of uniform and of adaptive tessellations
 # Most triangles of a scene; and the number of uniform triangles that take as long as choosing adaptive ones.
 MOST_TRIANGLES, FEW_TRIANGLES = 4_000_000, 20_000
-# Samples per pixel of albedo and normals, one ray each; 256 improve neither edges nor blurred parts.
-AUXILIARY_SPP = 64
+AUXILIARY_SPP = 64  # Samples per pixel of albedo and normals, one ray each; 256 improve neither edges nor blurred parts
 # Least number of lights to weigh, and least ratio of the mean square of their contributions to the squared mean: equal
 # probabilities are better for two or equal lights. Then the least share of a weight, and rays for each light.
 LEAST_LIGHTS, LEAST_UNEVEN, LEAST_WEIGHT, SCOUTS = 3, 1.3, 0.03, 2 * 160 * 120
