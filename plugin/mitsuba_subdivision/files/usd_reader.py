@@ -90,10 +90,8 @@ class MeshReader:
         points = self.skinning.points(mesh, points)
         matrix = np.eye(4) if is_local else self._local_to_world()
         mirrors = bool(np.linalg.det(matrix[:3, :3]) < 0)
-        order = None
-        if mirrors != self.is_left_handed():
-            order = reversed_order(sizes)
-            vertices = vertices[order]
+        order = reversed_order(sizes) if mirrors != self.is_left_handed() else None
+        vertices = vertices if order is None else vertices[order]
         if not np.array_equal(matrix, np.eye(4)):
             points = points @ matrix[:3, :3] + matrix[3, :3]
         points = validation.validated_positions(points, self._source)
