@@ -1,7 +1,6 @@
 """Sphinx settings of the documentation: the guide, the pages beside the code, and the API reference.
 
-Pages are written for GitHub. Links to other files download them. The README is above this folder, and begins the start
-page.
+Pages are written for GitHub. Links to other files download them. The README above this folder begins the start page.
 """
 
 import re

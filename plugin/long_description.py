@@ -1,8 +1,7 @@
 """The README for package indexes: a metadata hook of hatchling.
 
 Relative links do not work on an index. They become absolute, to files at the tag of the version, if ``[project.urls]``
-in ``pyproject.toml`` has a ``Repository`` on GitHub. Without it, a link becomes its text, and a picture its alternative
-text.
+in ``pyproject.toml`` has a ``Repository`` on GitHub. Without it, links become their text, pictures their alternative.
 """
 
 from __future__ import annotations

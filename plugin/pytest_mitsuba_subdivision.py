@@ -1,7 +1,6 @@
 """The pytest plugin of mitsuba-subdivision: the fixture ``render_regression`` and its options.
 
-This module is outside the package, as pytest imports plugins in every project of an environment, and the package
-imports Mitsuba.
+It is outside the package, which imports Mitsuba, as pytest imports plugins in every project of an environment.
 """
 
 from __future__ import annotations

@@ -18,8 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .llvm import require_llvm
 
-# Bytes of two packets of the widest numbers in kernels, and alignment of arrays: Dr.Jit compiles different kernels for
-# aligned and unaligned arrays.
+# Bytes of two packets of the widest numbers; alignment of arrays, as Dr.Jit compiles other kernels for unaligned ones.
 PACKETS, CACHE_LINE = 256, 64
 
 

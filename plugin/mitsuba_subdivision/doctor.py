@@ -21,8 +21,7 @@ PACKAGES = ("mitsuba", "drjit", "numpy", "scipy", "OpenEXR")
 DISTRIBUTION = "mitsuba-subdivision"
 _FOR_DEVELOPERS = ("dev", "test")  # Extras for developers of this package
 SECONDS = 120  # The start of Mitsuba on a slow disk takes some seconds, and a GPU's first kernels some more
-# Height of the limit surface of a cube with corners at -1 and 1, at the middle of a face: the limit mask of the
-# vertices of the refined cube.
+# Height of a cube's limit surface amid a face, for corners at -1 and 1: the limit mask of vertices of the refined cube.
 CUBE_HEIGHT = 68 / 81
 _PIXEL = 1e-6  # Half the side of the pixel, small enough for a constant height
 TOLERANCE = 1e-5
@@ -76,8 +75,7 @@ def try_variant(variant: str, needed: bool = True, seconds: float = SECONDS) -> 
     """Render a small surface in a separate process with a time limit, to report crashes.
 
     "works" is whether the surface is at the right place, or None if the machine lacks the device of an optional
-    variant; "problem" is the reason; "exact_shading" and "exact_problem" likewise. "llvm" is the major version of the
-    library that Dr.Jit has loaded.
+    variant; "problem" is the reason; "exact_shading" and "exact_problem" likewise. "llvm" is as of `loaded_version`.
     """
     start = time.monotonic()
     report = _in_process(variant, seconds)

@@ -13,17 +13,15 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from .cage import ControlCage
-from .cage.contents import RULES
+from .cage.contents import RULES, attributes_by_name
 from .mesh.connectivity import IntArray, Topology, VertexRule
 from .mesh.cuts import seams
 from .surface import LimitSurface
 
-# Number of classes of patches above which their weights dominate the time. Semi-sharp features count once for each
-# refinement that they outlast.
+# Classes of patches above which their weights dominate the time; semi-sharp ones count once for each refinement.
 MANY_CLASSES = 1000
 HIGH_VALENCE = 12  # Higher valences are visible in renders as a pinch
-# Bytes of a mesh in single precision: position and normal of a vertex; texture coordinates; vertices and element of a
-# triangle.
+# Bytes in single precision: position and normal of a vertex; texture coordinates; vertices and element of a triangle.
 VERTEX_BYTES, TEXCOORD_BYTES, TRIANGLE_BYTES = 24, 8, 16
 
 
@@ -127,10 +125,9 @@ def _sharp_features(cage: ControlCage) -> dict[str, int]:
 
 def _attributes(cage: ControlCage) -> dict[str, str]:
     t, described = cage.topology, {}
-    for name, attribute in {"texcoords": cage.texcoords, **cage.attributes}.items():
-        if attribute is not None:
-            described[name] = attribute.interpolation.replace("_", "-")
-        if attribute is not None and attribute.indices is not None:
+    for name, attribute in attributes_by_name(cage.texcoords, cage.attributes).items():
+        described[name] = attribute.interpolation.replace("_", "-")
+        if attribute.indices is not None:
             count = np.count_nonzero(seams(t, attribute.indices)[t.edge_half_edge])
             described[name] += f" with {count:,} seam edges, rule {cage.face_varying}"
     return described

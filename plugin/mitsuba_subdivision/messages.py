@@ -101,8 +101,7 @@ def _print(text: object, stream: TextIO | None) -> None:
             print(text, file=stream)
         stream.flush()
     except BrokenPipeError:
-        # Otherwise Python tries again when it ends.
-        with suppress(OSError, ValueError):
+        with suppress(OSError, ValueError):  # Otherwise Python tries again when it ends
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 

@@ -26,8 +26,7 @@ _BUFFERS = {"vertex_positions": "xyz", "vertex_normals": ("nx", "ny", "nz"), "ve
 def mitsuba_mesh(
     name: str,
     triangles: NDArray[np.integer],  # (m, 3)
-    # (n, k) each: `vertex_positions` and optional `vertex_normals`, `vertex_texcoords`, and attributes of vertices or
-    # faces, `vertex_NAME` or `face_NAME`
+    # (n, k) each: `vertex_positions`, optional `vertex_normals` and `vertex_texcoords`, `vertex_NAME` and `face_NAME`
     buffers: Mapping[str, NDArray],
     # Whether vertex normals are averages of their triangles'. Without normals, triangles are flat.
     averages_normals: bool = False,

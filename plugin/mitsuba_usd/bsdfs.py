@@ -206,8 +206,7 @@ class _Surface:
         normals = self._textures.normals(normal) if isinstance(normal, (TextureContents, NodeContents)) else None
         if normals is None:
             return bsdf
-        # Normals that face away from the viewer would be black. The shadowing function is, as in Cycles, for diffuse
-        # lobes only.
+        # Normals that face away from the viewer would be black. As in Cycles, only diffuse lobes have shadowing.
         shading = {"use_shadowing_function": is_diffuse, "flip_invalid_normals": True}
         return {"type": "normalmap", "normalmap": normals, **shading, "bsdf": bsdf}
 

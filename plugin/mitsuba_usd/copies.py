@@ -38,12 +38,8 @@ def with_large_copies(contents: SceneContents) -> SceneContents:
         or (bool(group) and sum(len(shape.cage.face_sizes) for shape in group) >= LARGE * len(group))
         for group in contents.groups
     ]
-    copies = [
-        instance.placed(shape)
-        for instance in contents.instances
-        if is_large[instance.group]
-        for shape in contents.groups[instance.group]
-    ]
+    placed = [instance for instance in contents.instances if is_large[instance.group]]
+    copies = [instance.placed(shape) for instance in placed for shape in contents.groups[instance.group]]
     # Two triangles for four corners, with one segment on each edge.
     if TRIANGLE_BYTES * sum(len(copy.cage.face_vertices) for copy in copies) / 2 > _allowed_bytes():
         return contents

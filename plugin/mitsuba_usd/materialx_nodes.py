@@ -349,8 +349,7 @@ def node(category: str, kind: str, **inputs: Input) -> Input:
 def node_of(category: str, kind: str, given: dict[str, Input]) -> Input:
     """A node of a type, simplified.
 
-    Constants are folded, nodes without effect are left out, and an image whose channels are selected, scaled and offset
-    by constants stays an image.
+    Constants are folded, nodes without effect left out; images of selected, scaled and offset channels stay images.
     """
     if category in SAMPLED:
         return NodeContents(category, kind, given)

@@ -334,8 +334,7 @@ def usd_scene(
     over : str or Path, optional
         A USD layer that is stronger than the file: materials, lights, cameras, visibility.
     weigh_lights : bool
-        Whether lights are sampled by their contributions, as by `mitsuba_subdivision.weigh_lights`. This loads the
-        scene once.
+        Whether to sample lights by their contributions, as by `mitsuba_subdivision.weigh_lights`; loads the scene once.
     **parameters
         Of every shape ``subdivision``, such as ``tessellation_rate=4`` or ``shading="vertex"``. By default shading is
         that of ``shading="auto"``, and triangles are as few as the picture needs, about 4 million at most. With exact

@@ -6,9 +6,10 @@ import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-from mitsuba_subdivision.cage import noting_warnings, shortened, warn, without_warnings
+from mitsuba_subdivision.cage import noting_warnings, warn, without_warnings
+from mitsuba_subdivision.files import listed
 
-_SHOWN, _LENGTH = 3, 200  # Number of prims in a message, and most characters of their names
+_SHOWN = 3  # Number of prims in a message
 # Details in which messages of one kind differ: texts in parentheses or quotes, paths and numbers.
 _DETAILS = re.compile(r"\([^()]*\)|\"[^\"]*\"|(?<!\w)/\S+|\d+(?:[.,]\d+)*")
 
@@ -51,16 +52,11 @@ class StageWarnings:
                 continue
             self._warned.add(kind)
             if kind not in self._first:
-                warn(f"{name}: {kind} ({_listed(prims)})")
+                warn(f"{name}: {kind} ({listed(prims, _SHOWN)})")
             elif len(prims) == 1:
                 warn(self._first[kind])
             else:
                 others = "another prim" if len(prims) == 2 else f"{len(prims) - 1} other prims"
-                warn(f"{self._first[kind]}; likewise {others} ({_listed(prims[1:])})")
+                warn(f"{self._first[kind]}; likewise {others} ({listed(prims[1:], _SHOWN)})")
         self._prims.clear()
         self._first.clear()
-
-
-def _listed(prims: list[str]) -> str:
-    more = f" and {len(prims) - _SHOWN} more" if len(prims) > _SHOWN else ""
-    return shortened(", ".join(prims[:_SHOWN]), _LENGTH) + more

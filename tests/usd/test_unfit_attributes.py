@@ -35,7 +35,7 @@ scene_at = partial(msub.usd_scene, mi=mi, tessellation_rate=1, shading="vertex",
 def scene_of(tmp_path, monkeypatch, meshes):
     """Points of each mesh of a scene by its name, each once, and what was told of the meshes, at full length."""
     monkeypatch.setattr(stage_warnings, "_SHOWN", len(meshes))
-    monkeypatch.setattr(stage_warnings, "_LENGTH", 10**6)
+    monkeypatch.setattr("mitsuba_subdivision.files.usd_stage._MOST_SHOWN", 10**6)
     flat(tmp_path / "black.png", [0] * 3)
     entries, messages = told(scene_at, write(tmp_path, PAINTS + "".join(meshes)))
     scene, more = told(mi.load_dict, entries, optimize=False)

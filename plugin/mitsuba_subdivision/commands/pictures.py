@@ -116,8 +116,7 @@ def _bitmap(image: NDArray[np.float32], channels: list[str], *, in_8_bits: bool)
         return mi.Bitmap(image, mi.Bitmap.PixelFormat.MultiChannel, channels)
     if not in_8_bits or image.shape[2] != 4:
         return mi.util.convert_to_bitmap(image, uint8_srgb=in_8_bits)
-    # PNG files have straight alpha.
-    rgba, straight = mi.Bitmap.PixelFormat.RGBA, mi.Bitmap.AlphaTransform.Unpremultiply
+    rgba, straight = mi.Bitmap.PixelFormat.RGBA, mi.Bitmap.AlphaTransform.Unpremultiply  # PNG files have straight alpha
     return mi.Bitmap(image, rgba).convert(rgba, mi.Struct.Type.UInt8, True, straight)
 
 

@@ -6,8 +6,7 @@ in the directions of the patch's, except in the middle children of triangles, wh
 The control points of a tile inside one polynomial piece are Bernstein coefficients, and so are those of its children. A
 tile with several pieces is divided into its four children, and its control points are those of its one-ring. Around an
 extraordinary point three children are pieces, and the fourth, which contains the point, is a tile of the same kind.
-Tiles of different patches that are divided in the same way share one `DividedTile` and its bounds; only their control
-points differ.
+Tiles of different patches that are divided in the same way share one `DividedTile` and its bounds.
 """
 
 from __future__ import annotations

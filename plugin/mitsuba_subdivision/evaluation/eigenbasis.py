@@ -30,8 +30,7 @@ class EigenbasisError(ArithmeticError):
 class Eigenbasis:
     """``A = V T L`` with ``L = V^-1``; T is diagonal except for the blocks of defective or complex eigenvalues.
 
-    Eigenvalues are sorted by decreasing modulus. All entries of column 0 of V are exactly one, so row 0 of L is the
-    limit stencil of the extraordinary point.
+    Moduli of eigenvalues decrease. Column 0 of V is exactly 1, so row 0 of L is the limit stencil of the point.
     """
 
     vectors: FloatArray  # (K, K) float64: V, right eigenvectors in columns
@@ -39,8 +38,7 @@ class Eigenbasis:
     # (K,) float64: one for each column of V; in a block, the mean of the real parts of its eigenvalues
     eigenvalues: FloatArray
     moduli: FloatArray  # (K,) float64: the modulus of each eigenvalue; in a block, the largest modulus
-    # tuple of (slice, (m, m) float64): the blocks of T that are not multiples of the identity, with the slice of their
-    # rows and columns
+    # tuple of (slice, (m, m) float64): blocks of T other than multiples of the identity, with their rows and columns
     blocks: tuple[tuple[slice, FloatArray], ...]
 
     @property

@@ -20,8 +20,7 @@ from .located_samples import LocatedSamples, by_uv, frame_magnitude, limit_stenc
 from .normals import unit_normals
 from .patch_tree import isolated_signature, patch_tree, refined_children
 
-# Tolerance of `irregular_curvature` when comparing |λ_4| / λ_2² with one. Curvature near an extraordinary point is
-# proportional to the power n of this ratio.
+# Tolerance when comparing |λ_4| / λ_2² with one. Curvature near an extraordinary point is proportional to its power n.
 CONSTANT = 1e-9
 
 
@@ -75,8 +74,7 @@ class SurfaceSamples(NamedTuple):
 
 def evaluate_samples(
     located: LocatedSamples,
-    # list of (m, K, x) float64: for each element, the control points of each of its samples. They are rounded to
-    # `dtype`, and may be overwritten.
+    # list of (m, K, x) float64: control points of each sample of each element; rounded to `dtype`, maybe overwritten
     points: list[FloatArray],
     extent: FloatArray,  # (x,) float64: bound of the extent of an element's control points along each axis
     # "stabilized" and "limit" compute relative to one control point of the element, so their precision does not
@@ -109,8 +107,7 @@ def evaluate_samples(
         if derivatives == 2:
             values[3:] = _second_by_uv(values[3:], jacobian) * scale[1]
     normal: FloatArray = np.full((3, count), np.nan, dtype=dtype)
-    # Only points in space have normals, texture coordinates do not.
-    if len(extent) == 3:
+    if len(extent) == 3:  # Only points in space have normals, texture coordinates do not
         framed = np.flatnonzero(located.per_sample([np.full(len(r.level), r.have_frame) for r in rows]))
         if len(framed):
             framed_samples, framed_points = located.chosen(framed), _chosen(points, located, framed)

@@ -73,8 +73,7 @@ def locate(domain: ParameterDomain, uv: FloatArray) -> tuple[NDArray[np.int64], 
 def child_rows(
     scheme: Scheme,
     uv: FloatArray,
-    # (3, R, K) float: `P_k Ā` for rows over control points, `P_k Ā V` for rows over eigen-coordinates. The rows have
-    # the same precision.
+    # (3, R, K) float, as the rows: `P_k Ā` for rows over control points, `P_k Ā V` for rows over eigen-coordinates
     tables: FloatArray,
     derivatives: int,
 ) -> tuple[NDArray[np.int64], FloatArray]:

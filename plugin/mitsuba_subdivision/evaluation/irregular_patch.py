@@ -20,9 +20,7 @@ from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, EigenbasisError, eigenbasis
 from .normals import limit_frame, uneven_frame
 from .polynomials import polynomial_basis
 
-# Two edge tangents are parallel if their determinant, relative to the square of their largest component, is not above
-# this.
-PARALLEL = 1e-6
+PARALLEL = 1e-6  # Largest determinant of parallel edge tangents, relative to the square of their largest component
 # Number of levels over which `rest_rows` takes the maximum. Powers of Jordan blocks may grow at first; their
 # eigenvalues are at most a half, up to rounding, so later powers are smaller.
 GROWING_LEVELS = 16
@@ -40,12 +38,10 @@ class IrregularPatch:
 
     scheme: Scheme
     signature: Signature  # Signature of the one-ring and of child 0
-    # (K,) int64: the vertices of the one-ring that are control points: all, except at a dart, where one of two equal
-    # vertices is left out
+    # (K,) int64: the vertices of the one-ring that are control points: all, but one of two equal vertices at a dart
     slots: IntArray
     matrix: FloatArray  # (K, K) float64: A, the control points of child 0 over those of the patch
-    # (3, R, K) float64: P_k Ā, the control points of the regular children 1, 2, 3, in the order of the scheme's
-    # lattice
+    # (3, R, K) float64: P_k Ā, control points of the regular children 1, 2, 3, in the order of the scheme's lattice
     children: FloatArray
 
     @cached_property

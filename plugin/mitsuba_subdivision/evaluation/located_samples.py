@@ -30,9 +30,8 @@ from .normals import TANGENT_ROUNDING
 from .patch_tree import MOST_DEPTH, PartKind, PatchTree, Piece, divide, not_isolated
 from .polynomials import polynomial_basis
 
-# Share of the absolute terms that `frame_magnitude` counts as weight. Weights of control points are sums over
-# eigen-coordinates, whose large terms may cancel and leave rounding errors. Times `TANGENT_ROUNDING`, this share is at
-# least one rounding error.
+# Share of the absolute terms that `frame_magnitude` counts as weight, as large terms of sums over eigen-coordinates may
+# cancel and leave rounding errors. Times `TANGENT_ROUNDING`, this share is at least one rounding error.
 CANCELLED = 1 / 16
 FEW_SAMPLES = 4  # A piece with fewer samples than this is replaced by a plane for each sample
 PLANE_POWERS = np.array([(0, 0), (1, 0), (0, 1)])  # Exponents of the monomials of a plane
@@ -67,8 +66,7 @@ class LocatedSamples:
     ) -> None:
         self.scheme, self._given = scheme, (elements, element, uv, corner)
         # Numbers of the children that contain each sample, as digits in base four below a leading one; the least
-        # significant digit is the child of the element. Two samples of an element lie in the same leaf if these are
-        # equal.
+        # significant digit is the child of the element. Samples of an element with the same path lie in the same leaf.
         self.path = np.zeros(len(uv), dtype=np.int64)
         self.leaf_sample = np.zeros(len(uv), dtype=np.int64)  # Number of each sample, counted through all `leaves`
         self._depths: list[list[Node]] = []
@@ -266,8 +264,7 @@ def sampled_polynomials(
     counts = np.diff(begins, append=len(order))
     has_plane = (number[order[begins]] < 0) | (counts < FEW_SAMPLES)
     in_planes = np.sort(order[np.repeat(has_plane, counts)])
-    # The first sample of each piece stands for it. The sort is stable, so that first samples are in the order of
-    # elements.
+    # The first sample of each piece stands for it. The sort is stable, so these are in the order of elements.
     in_pieces, first = order[~np.repeat(has_plane, counts)], order[begins[~has_plane]]
     plane, piece = np.full((2, len(element)), -1)
     plane[in_planes] = np.arange(len(in_planes))

@@ -28,8 +28,7 @@ TANGENT_ROUNDING = {32: 2.0**-19, 64: 2.0**-40}
 LEAST_EXTENT = {32: 2.0**-3, 64: 2.0**-11}
 # The smallest normal number by the number of bits; replaces a length of zero.
 LEAST_LENGTH = {32: 2.0**-126, 64: 2.0**-1022}
-# An eigenvector belongs to the border curve if the weight of an inner vertex, relative to the largest, is not above
-# this.
+# Largest weight of an inner vertex, relative to the largest of all, in eigenvectors that belong to the border curve.
 INSIDE = 1e-6
 ROUNDED = 1e-14  # Bound of the rounding error of sines of multiples of pi
 

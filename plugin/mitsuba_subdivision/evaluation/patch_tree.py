@@ -150,11 +150,9 @@ class PatchTree:
 
     def coefficients(
         self,
-        # (m, R) float64: maps the control points of a regular patch, in the order of the scheme's lattice, to
-        # coefficients
+        # (m, R) float64: from control points of a regular patch, in the order of the scheme's lattice, to coefficients
         form: FloatArray,
-        # Cache of the coefficients of children, which many parts share. It is not kept, as these arrays are by far the
-        # largest.
+        # Cache of the coefficients of children, which many parts share; not kept, as these arrays are the largest
         known: dict[PatchTree, FloatArray] | None = None,
     ) -> FloatArray:
         """Compute coefficients of the regular pieces over the element's one-ring. Returns (r, m, K)."""

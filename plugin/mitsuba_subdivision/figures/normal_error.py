@@ -147,8 +147,7 @@ def _draw_lines(axis: Axes, sensor: mi.Sensor, surface: LimitSurface, mesh: Tess
     width, height = sensor.film().crop_size()
     axis.set(xlim=(0, width), ylim=(height, 0))
     needles, edges = (staging.project(sensor, staging.moved(points, to_world)) for points in (needles, edges))
-    # The first needle is that of the extraordinary vertex.
-    first, *others = needles
+    first, *others = needles  # The first needle is that of the extraordinary vertex
     axis.add_collection(LineCollection(list(edges), colors="#40362a", linewidths=0.3, alpha=0.4))
     axis.add_collection(LineCollection(others, colors="#1c4f72", linewidths=0.6, capstyle="round"))
     axis.add_collection(LineCollection([first], colors="#d8452a", linewidths=1.5, capstyle="round"))
@@ -334,8 +333,7 @@ def parameter_extent(magnification: float) -> float:
 def panel_samples(surface: LimitSurface, magnification: float, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Samples of a grid of ``count`` segments along each side in a panel's part of every element at the point.
 
-    Returns parameters ``(s, 2)``, and positions on the stage and normals, ``(valence, s, 3)`` float64 each, as points
-    of the last panels coincide in float32.
+    Returns parameters ``(s, 2)``; positions on the stage and normals ``(valence, s, 3)``, too close for float32.
     """
     uv = staging.grid_points(np.linspace(0, 1, count + 1))
     uv[0] = 0.1 / count  # Stam's form has no value at the point itself

@@ -1,7 +1,6 @@
 """Surfaces of OpenSubdiv and Blender, computed by programs, for figures that compare with them.
 
-``python tests/peers/peers.py`` compiles the program for OpenSubdiv, `osd_peer`. If a program is not found, figures omit
-its surface with a message.
+``python tests/peers/peers.py`` compiles OpenSubdiv's program, `osd_peer`. Without a program, figures omit its surface.
 """
 
 from __future__ import annotations

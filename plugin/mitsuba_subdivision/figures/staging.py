@@ -23,8 +23,7 @@ from ..variants import SceneNode
 from .output import FigureError, FigureOptions, panels, show, write_figure
 
 PART_SAMPLES = 1 << 26  # Samples of one part, which determine a render's memory and its steps of progress
-# A single picture is wider than panels of a figure by this factor, with an aspect of 8 : 5.
-WIDER, HEIGHT = 2.25, 0.625
+WIDER, HEIGHT = 2.25, 0.625  # Width of single pictures relative to a panel's, and height relative to that
 LIFT = 2e-3  # Offset of points from their surface for visibility tests, relative to the camera's distance
 REFINEMENTS = 2  # Enough to isolate every extraordinary vertex
 FAR = 4  # Distance from the vertex beyond which faces are holes, relative to the shortest edge there

@@ -4,6 +4,7 @@ from .usd_reader import MeshReader, reversed_order
 from .usd_skinning import Skinning
 from .usd_stage import (
     HIDDEN_PURPOSES,
+    listed,
     local_to_world,
     open_stage,
     require_types,
@@ -15,6 +16,6 @@ from .usd_stage import (
 )
 
 __all__ = [
-    "HIDDEN_PURPOSES", "MeshReader", "Skinning", "local_to_world", "open_stage", "require_types", "require_usd",
-    "reversed_order", "time_of", "usd_errors_at", "usd_messages_of", "value_at",
+    "HIDDEN_PURPOSES", "MeshReader", "Skinning", "listed", "local_to_world", "open_stage", "require_types",
+    "require_usd", "reversed_order", "time_of", "usd_errors_at", "usd_messages_of", "value_at",
 ]  # fmt: skip

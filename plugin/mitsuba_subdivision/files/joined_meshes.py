@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..cage.contents import RULES, Attribute, CageContents
+from ..cage.contents import Attribute, CageContents
 from ..cage.errors import CageError, CageSource, shortened, warn
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
@@ -26,9 +26,7 @@ def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
     """
     if len(meshes) == 1:
         return meshes[0]
-    rules = {
-        rule: _common(rule, meshes, [mesh.rules[rule] for mesh in meshes]) for rule in RULES if rule in meshes[0].rules
-    }
+    rules = {rule: _common(rule, meshes, [mesh.rules[rule] for mesh in meshes]) for rule in meshes[0].rules}
     scheme = _common("scheme", meshes, [mesh.scheme for mesh in meshes])
     starts = {
         part: ragged.starts(np.array([len(getattr(mesh, rows)) for mesh in meshes])) for part, rows in _PARTS.items()

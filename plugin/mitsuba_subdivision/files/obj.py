@@ -65,8 +65,7 @@ def read_obj(path: str | Path) -> CageContents:
     """Read vertices, faces, texture coordinates, materials and OpenSubdiv's tags of a Wavefront OBJ file.
 
     Further columns of ``v`` and ``vt`` must be numbers, and are dropped; a missing v of a texture coordinate is 0.
-    Faces before the first ``usemtl`` have the material "". If only some corners have texture coordinates, the cage has
-    none.
+    Faces before the first ``usemtl`` have the material "". If some corners lack texture coordinates, the cage has none.
     """
     with open(path, "rb") as file:
         obj = _ObjText.split(f'"{path}"', file.read())

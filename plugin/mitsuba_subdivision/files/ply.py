@@ -180,8 +180,7 @@ def _color_of(names: Sequence[str]) -> tuple[str, ...]:
 def grouped(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Properties of each attribute, by the names of Mitsuba's ``ply``; see `read_ply`.
 
-    Numbered columns are one attribute if their numbers are complete. An attribute of one column may also end like the
-    first of several.
+    Numbered columns are one attribute if their numbers are complete. A lone column may end like the first of several.
     """
     color = _color_of(names)
     possible = {"color": color[:3]} if color else {}

@@ -37,8 +37,7 @@ def read_usd(
     """Read a mesh of a USD file, or all meshes, with subdivision attributes and primvars, in world space.
 
     ``prim``, ``time``, errors and warnings are those of `ControlCage.from_file`; the cage is not validated. Faces of
-    left-handed and mirrored meshes are reversed, to be counter-clockwise from outside. Skeletons and blend shapes move
-    the points.
+    left-handed and mirrored meshes become counter-clockwise from outside. Skeletons and blend shapes move the points.
     """
     name = f'"{path}"'
     if time is not None and not math.isfinite(time):
@@ -91,10 +90,8 @@ class MeshReader:
         points = self.skinning.points(mesh, points)
         matrix = np.eye(4) if is_local else self._local_to_world()
         mirrors = bool(np.linalg.det(matrix[:3, :3]) < 0)
-        order = None
-        if mirrors != self.is_left_handed():
-            order = reversed_order(sizes)
-            vertices = vertices[order]
+        order = reversed_order(sizes) if mirrors != self.is_left_handed() else None
+        vertices = vertices if order is None else vertices[order]
         if not np.array_equal(matrix, np.eye(4)):
             points = points @ matrix[:3, :3] + matrix[3, :3]
         points = validation.validated_positions(points, self._source)

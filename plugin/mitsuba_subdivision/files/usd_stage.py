@@ -116,15 +116,15 @@ def _warn_of_no_effect(name: str, layer: Sdf.Layer, stage: Usd.Stage) -> None:
 
     layer.Traverse(layer.pseudoRoot.path, visit)
     if missing:
-        warn(f"{name}: there are no prims {_listed(sorted(missing), 3)} to change")
+        warn(f"{name}: there are no prims {listed(sorted(missing), 3)} to change")
     if in_instances:
-        parts = _listed(sorted(in_instances), 3)
+        parts = listed(sorted(in_instances), 3)
         warn(f"{name}: {parts} are parts of instances, which USD shares; expected instanceable = false above them")
 
 
 def _warn_of_missing(name: str, errors: list[str]) -> None:
     if documents := [match[1] for match in map(_MATERIALX.search, errors) if match]:
-        files = _listed(sorted({os.path.basename(document) for document in documents}), 3)
+        files = listed(sorted({os.path.basename(document) for document in documents}), 3)
         count = f"{len(documents)} references" if len(documents) > 1 else "a reference"
         hint = 'the package materialx reads documents; pip install "mitsuba-subdivision[files]"'
         left_out = f"{count} to MaterialX documents left out, which usd-core cannot open ({files})"
@@ -273,19 +273,19 @@ def chosen_meshes(
     below = list(meshes)
     if path not in (None, ALL):
         if not Sdf.Path.IsValidPathString(path):
-            raise CageError(f'{name}: prim "{path}" is no path; expected one such as {_listed(meshes)}')
+            raise CageError(f'{name}: prim "{path}" is no path; expected one such as {listed(meshes)}')
         wanted = Sdf.Path(path)
         below = [wanted] if wanted in meshes else [mesh for mesh in meshes if mesh.HasPrefix(wanted)]
     if not below:
         prim = stage.GetPrimAtPath(path)
         what = f'is a prim of the type "{prim.GetTypeName()}" without meshes' if prim else "is not in the file"
-        raise CageError(f"{name}: prim {path} {what}; expected one of {_listed(meshes)}")
+        raise CageError(f"{name}: prim {path} {what}; expected one of {listed(meshes)}")
 
     def without(paths: list[Sdf.Path], is_skipped: Callable[[UsdGeom.Mesh], bool], why: str) -> list[Sdf.Path]:
         """The meshes that are not skipped, with a warning about the others; all meshes if none would remain."""
         kept = [mesh for mesh in paths if not is_skipped(meshes[mesh])]
         if kept and len(kept) < len(paths):
-            warn(f"{name}: meshes {_listed(mesh for mesh in paths if mesh not in kept)} left out, as {why}")
+            warn(f"{name}: meshes {listed(mesh for mesh in paths if mesh not in kept)} left out, as {why}")
         return kept or paths
 
     if path == ALL:
@@ -300,12 +300,13 @@ def chosen_meshes(
         below = without(below, lambda mesh: str(value_at(mesh.GetSubdivisionSchemeAttr(), time)) in FLAT_SCHEMES, why)
     if len(below) > 1 and path != ALL:
         where = f" below {path}" if path else ""
-        expected = f'expected prim to name one of {_listed(below)}, or "{ALL}" for all'
+        expected = f'expected prim to name one of {listed(below)}, or "{ALL}" for all'
         raise CageError(f"{name}: there are {len(below)} meshes{where}; {expected}")
     return [meshes[mesh] for mesh in below]
 
 
-def _listed(paths: Iterable[Any], shown: int = 20) -> str:
+def listed(paths: Iterable[Any], shown: int = 20) -> str:
+    """The first names, shortened, and the number of the others."""
     names = [str(path) for path in paths]
-    listed = shortened(", ".join(names[:shown]), _MOST_SHOWN)
-    return listed + (f" and {len(names) - shown} more" if len(names) > shown else "")
+    more = f" and {len(names) - shown} more" if len(names) > shown else ""
+    return shortened(", ".join(names[:shown]), _MOST_SHOWN) + more

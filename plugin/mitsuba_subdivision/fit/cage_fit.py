@@ -89,8 +89,7 @@ class CageFit(Fit):
     """Fits a cage to images by moving its control points.
 
     Every step renders all views into one graph, differentiates it once, and moves the points by Adam in the coordinates
-    of `LargeSteps`. From coarse to fine, the cage is refined during the fit: the surface stays, with four times as many
-    control points.
+    of `LargeSteps`. The cage may be refined during the fit: the surface stays, with four times as many control points.
 
     Parameters
     ----------
@@ -98,8 +97,7 @@ class CageFit(Fit):
         Initial cage. Topology, tags and rules change only by refinement.
     views : sequence of View
     scene : dict
-        The scene without the surface, as for ``mi.load_dict``: emitters, other shapes, and an integrator, by default
-        ``direct_projective``.
+        As for ``mi.load_dict``, without the surface: emitters, shapes, integrator (by default ``direct_projective``).
     shape : dict, optional
         Parameters of the shape without its cage, such as ``bsdf`` and ``tessellation_rate`` (4 by default).
     scheme : str, optional
@@ -114,11 +112,9 @@ class CageFit(Fit):
     laplacian : "cage" or "surface"
         Laplacian of `LargeSteps`: of the cage's edges, or of the initial limit surface.
     sharp_edges : (n, 2) array of int, optional
-        0-based ends of edges whose sharpness is also fitted, from its value in ``cage``. Refinement decreases it by
-        one, down to 0.
+        0-based ends of edges whose sharpness is fitted, too, from that in ``cage``. Refinement subtracts 1, down to 0.
     crease_of : (n,) array of int, optional
-        0-based crease of each of these edges. Edges of a crease have one sharpness, initially the mean. By default each
-        edge is a separate crease.
+        0-based crease of each of these edges, with one sharpness, initially the mean. By default each edge is a crease.
     highest_sharpness : int
         Upper bound of the sharpness, 1 to 6; refinement decreases it by one, down to 1. The shape's cage is refined as
         many times: see `UnknownCreases`.

@@ -111,8 +111,7 @@ class Fit(ABC):
         ----------
         steps : int
         checkpoint : path, optional
-            File for `save_checkpoint` after every ``every`` steps, at the end, and after Ctrl-C, of the last complete
-            step.
+            File for `save_checkpoint` after every ``every`` steps, at the end, and of the last whole step after Ctrl-C.
         every : int
         """
         if checkpoint is None:

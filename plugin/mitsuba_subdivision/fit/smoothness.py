@@ -106,8 +106,7 @@ def regularizer(name: str, start: LimitSurface) -> Callable[[dr.ArrayBase], mi.F
     name : "laplacian" | "bending" | "anchor" | "folds"
         As in `CageFit`.
     start : LimitSurface
-        Initial surface: "anchor" measures distances from its control points, "bending" uses its metric, see
-        `LimitSurface.bending`.
+        Initial surface, with the control points of "anchor" and the metric of "bending" (`LimitSurface.bending`).
 
     Returns
     -------

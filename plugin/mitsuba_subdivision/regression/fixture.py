@@ -66,8 +66,7 @@ class RenderRegression:
     ) -> Comparison | None:
         """Render a scene, and fail the pytest test if the render differs from the scene's reference.
 
-        Undecided comparisons are warnings of pytest, and properties of the test in JUnit files. Returns None if the
-        reference was written.
+        Undecided comparisons are warnings, and properties in JUnit files. Returns None if the reference was written.
 
         Parameters
         ----------

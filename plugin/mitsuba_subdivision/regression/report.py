@@ -67,8 +67,7 @@ def write_index(folder: str | Path) -> Path | None:
     if not rows:
         (folder / PAGE).unlink(missing_ok=True)
         return None
-    rows.sort(key=lambda row: ["fail", "warn", "pass"].index(row[0]))
-    lines = "".join(line for _, line in rows)
+    lines = "".join(line for _, line in sorted(rows, key=lambda row: ["fail", "warn", "pass"].index(row[0])))
     body = f"<h1>Render-difference tests</h1><table class=tiers>{lines}</table>"
     write_text(folder / PAGE, _document("Render-difference tests", body))
     return folder / PAGE

@@ -368,8 +368,7 @@ def _z_scores(
 
     Let D be the difference of a tile's means and s^2 its variance, the sum of both images'. Each is a sum over batches
     of its pixels, so that D / s has Student's distribution, with the degrees of freedom of [Welch 1947]. It is
-    converted to a normal variable by [Wallace 1959]. The test has a least variance, and pixels have a least standard
-    error.
+    converted to a normal variable by [Wallace 1959]. Variances of the test and errors of pixels have least values.
     """
     area = _tile_sums(np.ones((*test.count.shape, 1)), side)
     difference, bias = (_tile_sums(values, side) / area for values in (test.mean - reference.mean, floor))

@@ -85,8 +85,7 @@ class CatmullClark(Scheme):
             n_v + n_e + n_f,
             n_v,
             (vertex_of_face, origin, 1 / size),
-            # The edge point gets from each half-edge the origin and the face point, and from a border half-edge both
-            # ends.
+            # The edge point gets the origin and the face point of each half-edge, and both ends of a border half-edge.
             (vertex_of_edge, origin, end_weight),
             (vertex_of_edge[is_border], end[is_border], end_weight[is_border]),
             (vertex_of_edge[edge_corner], member[in_edge_point], (face_weight / size)[edge_corner]),

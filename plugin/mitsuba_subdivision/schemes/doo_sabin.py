@@ -41,8 +41,7 @@ class DooSabin(Scheme):
     def refine(self, topology: Topology) -> Refinement:
         """Create one face for every face, inner edge and inner vertex, in this order.
 
-        Refined vertex ``h`` belongs to the face corner ``h``. The half-edges of refined faces inside coarse faces keep
-        their indices.
+        Refined vertex ``h`` belongs to the face corner ``h``. Half-edges inside coarse faces keep their indices.
         """
         t = topology
         corners = np.arange(t.half_edge_count)
@@ -55,8 +54,7 @@ class DooSabin(Scheme):
         refined = Topology(t.half_edge_count, sizes, np.concatenate([corners, edge_faces.ravel(), fans]))
 
         size, begin = t.face_sizes[t.face], t.face_offsets[t.face]
-        # One mask for each face, with a weight for each of its corners, so that cosines are computed once for each
-        # face.
+        # One mask for each face, with a weight for each of its corners: cosines are computed once for each face.
         steps = corners - begin
         mask = np.where(steps == 0, (size + 5) / (4 * size), (3 + 2 * np.cos(2 * np.pi * steps / size)) / (4 * size))
         corner = np.repeat(corners, size)

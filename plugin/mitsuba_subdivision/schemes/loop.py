@@ -86,8 +86,7 @@ class Loop(Scheme):
         """Split every triangle into four.
 
         Refined vertices: the coarse vertices, then one for each edge. Triangle ``h`` is the corner at half-edge ``h``,
-        listed from the coarse vertex on; then come the middle triangles, listed from the edge point of the face's first
-        edge on.
+        listed from the coarse vertex on; then come the middle triangles, from the edge point of the face's first edge.
         """
         t = topology
         n_v, n_e = t.vertex_count, t.edge_count

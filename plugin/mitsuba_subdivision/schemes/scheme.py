@@ -17,8 +17,7 @@ from ..mesh.signature import ElementKind
 from .domain import FloatArray, ParameterDomain, ParameterMap
 
 if TYPE_CHECKING:
-    # Importing SciPy's sparse arrays takes 0.1 s and 20 MB, and local meshes do not need them.
-    from scipy import sparse
+    from scipy import sparse  # Importing SciPy's sparse arrays takes 0.1 s and 20 MB, and local meshes do not need them
 
 _SCHEMES: dict[str, Scheme] = {}
 

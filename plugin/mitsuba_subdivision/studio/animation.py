@@ -29,8 +29,7 @@ Contents = TypeVar("Contents")
 class SceneSource(ABC, Generic[Contents]):
     """Scenes of a model, from its contents in a frame: `CageScenes` of one cage, or `StageScenes` of a USD file.
 
-    Raises CageError if frames are neither times of a USD file nor numbered files. Raises FileNotFoundError if there is
-    no file for a frame.
+    Raises CageError if frames are neither times of a USD file nor numbered files, FileNotFoundError without a file.
     """
 
     factor: float | None = None  # Enlargement of the model in the scene; None before points are known

@@ -140,8 +140,7 @@ def _texture(folder: Path, text: str, left_out: dict[str, None]) -> SceneNode:
 def material_bsdf(material: Material, name: str) -> SceneNode:
     """The BSDF of a material.
 
-    Phong's exponent ``Ns`` becomes the roughness of an equally wide highlight: ``alpha^2 = 2 / (Ns + 2)``, where
-    ``alpha`` is the square of the roughness.
+    Phong's exponent ``Ns`` becomes the roughness r of an equally wide highlight: ``r^4 = 2 / (Ns + 2)``.
     """
     diffuse, highlights = _numbers(material, "Kd", 0.8, 0.8, 0.8), _numbers(material, "Ks", 0.0, 0.0, 0.0)
     colour: SceneNode = {"type": "rgb", "value": np.clip(diffuse, 0, 1).tolist()}

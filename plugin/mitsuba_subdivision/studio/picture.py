@@ -27,8 +27,7 @@ MOST_VERTICES = {"exact": 0.95, "vertex": 0.99}
 MOST_SEGMENTS, FINEST_RATE = 8, 64  # Most segments on each edge of a cage: of uniform and of adaptive tessellations
 # Most triangles of a scene; and the number of uniform triangles that take as long as choosing adaptive ones.
 MOST_TRIANGLES, FEW_TRIANGLES = 4_000_000, 20_000
-# Samples per pixel of albedo and normals, one ray each; 256 improve neither edges nor blurred parts.
-AUXILIARY_SPP = 64
+AUXILIARY_SPP = 64  # Samples per pixel of albedo and normals, one ray each; 256 improve neither edges nor blurred parts
 # Least number of lights to weigh, and least ratio of the mean square of their contributions to the squared mean: equal
 # probabilities are better for two or equal lights. Then the least share of a weight, and rays for each light.
 LEAST_LIGHTS, LEAST_UNEVEN, LEAST_WEIGHT, SCOUTS = 3, 1.3, 0.03, 2 * 160 * 120
@@ -133,14 +132,12 @@ def weigh_lights(scene: mi.Scene, sensor: int = 0) -> bool:
     """Set the ``sampling_weight`` of lights to their contributions to a picture, which stays unbiased.
 
     Mitsuba samples all lights with equal probability. Here, the direct light of each is rendered with a few rays; no
-    weight is below 0.03 of the sum. Equal probabilities spread samples evenly over a pixel, so weights help for uneven
-    lights only.
+    weight is below 0.03 of the sum. Equal probabilities spread samples evenly over pixels: weights help uneven lights.
 
     Parameters
     ----------
     scene : mi.Scene
-        Its lights are changed, unless they are fewer than 3, nearly equal or already weighted, or the variant is
-        scalar.
+        Its lights are changed, unless they are fewer than 3, nearly equal or weighted, or the variant is scalar.
     sensor : int
         The sensor of the picture.
 
@@ -208,9 +205,8 @@ def render_denoised(
 ) -> NDArray[np.float32]:
     """Render a scene with the box filter, and remove its noise by Open Image Denoise.
 
-    With a wider filter, noise of neighbouring pixels is correlated, and the denoiser keeps it. Albedo and normals of
-    the first hits preserve textures and edges. Denoised pictures are biased: do not compare them or use them as
-    references.
+    Wider filters correlate the noise of neighbouring pixels, and the denoiser keeps it. Albedo and normals of the first
+    hits preserve textures and edges. Denoised pictures are biased: do not compare them or use them as references.
 
     Parameters
     ----------

@@ -254,8 +254,7 @@ def angles_of(view: View) -> tuple[float, float]:
 def studio_axes(up: str) -> NDArray[np.float64]:
     """Axes of the studio in the world: columns right, back and up ``(3, 3)``, for a viewer in front.
 
-    As in modelling programs, the front is -y if z is up, +z if y is up. Raises ValueError if the axis is neither y nor
-    z.
+    As in modelling programs, the front is -y if z is up, +z if y is up. Raises ValueError for any other axis.
     """
     if up not in UP_AXES:
         raise ValueError(f'up axis "{up}"; expected {" or ".join(UP_AXES)}')

@@ -16,8 +16,7 @@ from ..schemes.scheme import Scheme
 DOMAIN_TOLERANCE = 1e-12  # Distance by which rounding may put a parameter outside its domain
 # Most faces around a vertex, and most corners of a face, as in OpenSubdiv. Eigenbases of such one-rings take 3 seconds.
 MOST_FACES = 511
-# Most faces around a vertex at the end of a crease, or with semi-sharp features: each face has a different one-ring,
-# and that many eigenbases take as long.
+# The same at ends of creases and with semi-sharp features, where each face has another one-ring and so eigenbasis.
 MOST_DIFFERENT_FACES = 64
 
 

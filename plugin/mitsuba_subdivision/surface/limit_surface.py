@@ -205,8 +205,7 @@ class LimitSurface:
     def channel(self, name: str) -> Channel:
         """The interpolation of an attribute, or of the texture coordinates ("texcoords"), over the elements.
 
-        Repeated calls return the same object. Raises ValueError if the cage has no such attribute, and SchemeError if
-        the scheme has no rules for it.
+        Repeated calls return the same object. Raises ValueError without such an attribute, SchemeError without rules.
         """
         if name not in self._channels:
             attributes = attributes_by_name(self.cage.texcoords, self.cage.attributes)
@@ -247,8 +246,7 @@ class LimitSurface:
         """Area of the surface, in squared units of the cage's space.
 
         Computed by Gauss quadrature of every polynomial piece, at all levels around extraordinary points, to a relative
-        accuracy of 1e-12; where the surface is folded along a curve inside an element, to about 1e-8 of the pieces
-        there.
+        accuracy of 1e-12; where it is folded along a curve inside an element, to about 1e-8 of the pieces there.
 
         Raises
         ------
@@ -302,8 +300,7 @@ class LimitSurface:
         Returns
         -------
         (n_v, n_v) CSR array of float64
-            Symmetric, positive semi-definite. Constants are in its null space; for a flat surface, so are its
-            coordinates.
+            Symmetric, positive semi-definite. Constants are in its null space, and coordinates of a flat surface.
 
         Raises
         ------
@@ -346,8 +343,7 @@ class LimitSurface:
     def closest_point(self, points: ArrayLike) -> ClosestPoints:
         """Find the nearest point of the surface for each given point; where several are nearest, one of them.
 
-        The result is the global minimum of the distance. The first call prepares a search, which takes some
-        milliseconds for a hundred faces.
+        The distance is a global minimum. The first call prepares a search, in some milliseconds for a hundred faces.
 
         Parameters
         ----------
@@ -469,8 +465,7 @@ class LimitSurface:
         Warns
         -----
         CageWarning
-            If parts of the surface need more segments than ``max_rate`` for the criterion. A criterion for outlines
-            never warns.
+            If parts of the surface need more than ``max_rate`` segments, except by a criterion for outlines.
         """
         points, shape = self.cage.positions, self.cage.positions.shape
         if control_points is not None:
