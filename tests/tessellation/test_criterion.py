@@ -9,13 +9,7 @@ from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.evaluation.polynomials import BernsteinBasis
 from mitsuba_subdivision.schemes.domain import SQUARE
-from mitsuba_subdivision.tessellation.criterion import (
-    BESIDE_OUTLINE,
-    Cone,
-    Criterion,
-    Sensor,
-    least_product,
-)
+from mitsuba_subdivision.tessellation.criterion import BESIDE_OUTLINE, Cone, Criterion, Sensor, least_product
 from patches.closed_cages import bumpy, torus
 from reference.refined_cages import sheet
 from scipy.spatial import ConvexHull
