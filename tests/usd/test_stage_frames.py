@@ -385,9 +385,6 @@ def test_shutters_need_a_time_and_an_open_interval(tmp_path, capsys):
         StillPicture(StageScenes(crossing(tmp_path, 0, 0.5), LOOK, RATE))
 
 
-# Shading and triangles that whole stages have by default.
-
-
 @pytest.fixture
 def path(tmp_path):
     return write(tmp_path, STILL + INSTANCES)
