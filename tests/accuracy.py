@@ -1,4 +1,3 @@
-# ruff: noqa: T201
 """Print how accurate the evaluators are for each scheme and valence, and whether the project's bars hold.
 
     python tests/accuracy.py [--high]

@@ -1,4 +1,3 @@
-# ruff: noqa: T201
 """What comparisons of renders notice, and how often they fail where nothing has changed.
 
 Five scenes, four of them with rare bright paths, are rendered unchanged and with small changes, with other seeds than

@@ -1,4 +1,3 @@
-# ruff: noqa: T201
 """How well a cage and a dense mesh of triangles are fitted to the same pictures.
 
 Targets are seen by eight cameras. Both fits begin as the same ball and take as many steps, from the same renders: the

@@ -1,4 +1,3 @@
-# ruff: noqa: T201
 """How exact gradients are: of pictures inside an outline, of outlines, and of integrals over triangles.
 
 Inside: the derivative of a picture's mean by a motion of the control points that turns what is seen, beside central
@@ -12,8 +11,6 @@ differentiated by differences.
 Triangles: derivatives of area, volume, first and second moments of tessellations by motions of the control points,
 beside those of the limit surface by quadrature, in parts of these.
 """
-
-from __future__ import annotations
 
 import argparse
 import sys

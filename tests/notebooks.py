@@ -1,4 +1,3 @@
-# ruff: noqa: T201
 """Run the notebooks of the guide and store what they show.
 
 Each runs from its first cell to its last in a new kernel and an empty folder, and is written back without anything that

@@ -1,4 +1,3 @@
-# ruff: noqa: T201
 """How exact what a picture shows is: normals and mirror images of both kinds of shading, by tessellation rate.
 
 Each cage is seen by one ray through the middle of each pixel. Its normals, and the radiance that a mirror would show
@@ -6,8 +5,6 @@ under a sky, are compared with exact shading of a tessellation of 64 segments pe
 the same place of the surface to 3 % of the cage's size. Outlines depend on the triangles alone, and are left
 out.
 """
-
-from __future__ import annotations
 
 import argparse
 

@@ -1,4 +1,3 @@
-# ruff: noqa: T201
 """How many triangles an adaptive tessellation has where a uniform one has the same error.
 
 Chords: the uniform tessellation's largest distance from the surface is measured at points of its triangles, and asked
@@ -8,8 +7,6 @@ Outlines: the edges of triangles with nothing behind them on one side, as a came
 a tessellation of 64 segments per edge. Their distance is Hausdorff's, in pixels of a picture 512 pixels wide. The
 adaptive tessellation is the coarsest found, of pixel errors in steps of 3 %, whose outline is no further away.
 """
-
-from __future__ import annotations
 
 import argparse
 from pathlib import Path

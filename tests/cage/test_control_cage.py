@@ -10,7 +10,7 @@ from mitsuba_subdivision.cage import Attribute, CageError, ControlCage, cage_of
 from mitsuba_subdivision.cage.contents import RULES, CageContents, same
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from patches.closed_cages import mixed_torus, polygons, torus
-from peers.fidelity_cages import SURFACES
+from peers.fidelity_cages import SURFACES, edges_of
 from reference.refined_cages import tagged
 from scipy.spatial import cKDTree
 
@@ -182,10 +182,6 @@ def cage(request):
     return manifolds[request.param]() if request.param in manifolds else SURFACES[request.param]
 
 
-def around(polygon):
-    return list(zip(polygon, [*polygon[1:], polygon[0]], strict=True))
-
-
 def uncancelled(sides):
     return Counter(sides) - Counter((end, start) for start, end in sides)
 
@@ -199,8 +195,8 @@ def test_every_edge_is_there_once_and_triangles_cover_the_faces(cage):
     # Of the sides of a face's triangles, its edges are left where opposite ones, the diagonals, cancel.
     triangles = iter(cage.triangles.tolist())
     for face in faces:
-        sides = [side for triangle in islice(triangles, len(face) - 2) for side in around(triangle)]
-        assert uncancelled(sides) == uncancelled(around(face))
+        sides = [side for triangle in islice(triangles, len(face) - 2) for side in edges_of(triangle)]
+        assert uncancelled(sides) == uncancelled(edges_of(face))
     assert not list(triangles)
 
 
@@ -238,13 +234,6 @@ def test_edges_of_many_vertices():
 VALENCES = [3, 4, 5, 6, 8, 13, 40]
 
 
-def are_corners_convex(cage):
-    """Whether every corner of the quads of a star-shaped cage is convex as seen from outside."""
-    corners = cage.positions[cage.face_vertices.reshape(-1, 4)]
-    before, after = np.roll(corners, 1, axis=1), np.roll(corners, -1, axis=1)
-    return (np.einsum("fki,fki->fk", corners, np.cross(corners - before, after - corners)) > 0).all()
-
-
 def test_less_than_three_faces_around_a_vertex_are_an_error():
     with pytest.raises(CageError, match="valence 2; expected at least 3"):
         extraordinary(2)
@@ -254,7 +243,10 @@ def test_less_than_three_faces_around_a_vertex_are_an_error():
 def test_extraordinary_is_a_closed_convex_symmetric_ball_of_these_valences(valence):
     cage = extraordinary(valence)
     np.testing.assert_allclose(np.linalg.norm(cage.positions, axis=1), 1)
-    assert are_corners_convex(cage)
+    corners = cage.positions[cage.face_vertices.reshape(-1, 4)]
+    before, after = np.roll(corners, 1, axis=1), np.roll(corners, -1, axis=1)
+    # As seen from outside; around the origin, the ball is star-shaped.
+    assert (np.einsum("fki,fki->fk", corners, np.cross(corners - before, after - corners)) > 0).all()
     expected = Counter([valence] * 2 + [3] * (2 * valence))
     expected[4] += cage.vertex_count - 2 - 2 * valence
     assert Counter(cage.topology.vertex_face_count.tolist()) == expected

@@ -2,17 +2,16 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import mitsuba_subdivision
+from documents.pages import ROOT, read
 
-ROOT = Path(__file__).resolve().parents[2]
 SPHINX = "python -m sphinx -q -W plugin"
 
 
 def test_the_documentation_is_built_without_warnings(tmp_path):
     """One site: the README begins it, and guide, formulas, notebooks and API reference lead to each other."""
-    assert f"\n{SPHINX} " in (ROOT / "plugin" / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    assert f"\n{SPHINX} " in read("plugin/CONTRIBUTING.md")
     *command, source = SPHINX.split()[1:]
     words = [sys.executable, *command, "-d", str(tmp_path / "doctrees"), source, str(tmp_path / "html")]
     done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)

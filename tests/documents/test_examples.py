@@ -281,7 +281,7 @@ def test_the_table_of_formats_has_every_suffix_and_its_extra():
     assert {extra for row in rows for extra in quoted(row[2])} <= set(EXTRAS)
 
 
-def test_statements_of_the_table_of_tags_mean_what_it_says(tmp_path):
+def test_statements_of_the_table_of_tags_have_their_meanings(tmp_path):
     path = tmp_path / "cage.obj"
 
     def contents(*statements):

@@ -24,18 +24,10 @@ from mitsuba_subdivision.figures import (
     normal_error,
     peers,
     scenes,
+    staging,
 )
 from mitsuba_subdivision.figures.output import rows_of, write_figure
-from mitsuba_subdivision.figures.staging import (
-    around_vertices,
-    frame,
-    in_view,
-    load_stage,
-    motion,
-    moved,
-    project,
-    visible,
-)
+from mitsuba_subdivision.figures.staging import around_vertices, frame, load_stage, motion, moved, project, visible
 from mitsuba_subdivision.regression.image import read_channels
 from mitsuba_subdivision.schemes import scheme_named
 from patches.closed_cages import extraordinary_triangles, torus
@@ -174,7 +166,7 @@ def test_the_whole_cage_is_in_the_picture_of_creases():
     sensor = load_stage("creases", width=20, height=31).sensors()[0]
     for shape in ([1, 1, 1], [9, 1, 1], [1, 9, 0.1], [0.1, 0.1, 9]):
         cage = cube().with_positions(7 + cube().positions * shape)
-        shown = in_view(cage, sensor)
+        shown = staging.in_view(cage, sensor)
         x, y = project(sensor, shown.positions).T
         assert min(x.min(), y.min(), 20 - x.max(), 31 - y.max()) > 0
         # It fills the picture in one direction, but for the margin and a step of its sizes.
@@ -358,7 +350,7 @@ def test_the_characteristic_map_scales_by_the_subdominant_eigenvalue():
         image = partial(characteristic.on_patch, scheme, patch.signature, points)
         first, third = (image(characteristic.sub_domain(scheme.domain, level, 2)) for level in (0, 2))
         np.testing.assert_allclose(third, patch.basis.subdominant**2 * first, atol=1e-12)
-        # One characteristic.sector ends where the next begins.
+        # One sector ends where the next begins.
         edge = np.array([(0.0, 0.7), (0.7, 0.0)])
         np.testing.assert_allclose(image(edge[:1]), characteristic.sector(image(edge[1:]), 1, 5), atol=1e-12)
 
@@ -379,7 +371,7 @@ def test_subdivision_keeps_the_number_of_extraordinary_points():
 
 
 @pytest.mark.usefixtures("variants_all_rgb")
-def test_projection_finds_what_the_camera_sees():
+def test_projected_points_are_where_pictures_show_them():
     to_world = mi.ScalarTransform4f().look_at([3, -4, 5], [0, 0, 0], [0, 0, 1])
     place = np.array([0.3, -0.2, 0.4])
     twice = to_world @ mi.ScalarTransform4f().scale(2)

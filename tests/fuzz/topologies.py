@@ -9,7 +9,6 @@ import sys
 import traceback
 import warnings
 from collections import Counter
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
 from mitsuba_subdivision.mesh.connectivity import VertexRule
-from peers.fidelity_cages import edges_of
+from peers.fidelity_cages import edges_of, triangulated
 from reference.refined_cages import refined
 
 # Points and unit normals, of cages of a size of some units.
@@ -107,10 +106,6 @@ def doubled(faces):
     copied = [tuple(v if v in border else v + count for v in face[::-1]) for face in faces]
     origin = {v: v % count for face in faces + copied for v in face}
     return numbered(faces + copied), [origin[v] for v in sorted(origin)]
-
-
-def triangulated(faces):
-    return [(face[0], a, b) for face in faces for a, b in pairwise(face[1:])]
 
 
 def random_topology(rng):

@@ -36,7 +36,6 @@ def on_host(table, positions, matrix):
 
 
 def extrapolated(function):
-
     def central(step):
         return [(a - b) / (2 * step) for a, b in zip(function(step), function(-step), strict=True)]
 

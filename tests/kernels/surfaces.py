@@ -9,15 +9,7 @@ import numpy as np
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
 from mitsuba_subdivision.device_arrays import upload
-from patches.closed_cages import (
-    bumpy,
-    cage_of,
-    extraordinary_face,
-    extraordinary_triangles,
-    mixed_torus,
-    trapezohedron,
-    triangulated,
-)
+from patches.closed_cages import bumpy, cage_of, extraordinary_face, extraordinary_triangles, trapezohedron
 from peers.fidelity_cages import book
 from reference.refined_cages import half_disc, sheet, spokes, tagged, upper_half
 
@@ -25,12 +17,10 @@ CAGES = Path(__file__).parents[2] / "scenes/cages"
 INFINITE = 10.0
 RING = ((4, 5), (5, 7), (7, 6), (6, 4))
 UNEQUAL = [(a, b, s) for (a, b), s in zip(RING, (0.4, 1.3, 2.2, 4), strict=True)]
-
-
 SURFACES = {
     "torus": ("catmull_clark", lambda: cage_of("catmull_clark", "torus")),
     "cube": ("catmull_clark", cube),
-    "mixed torus": ("catmull_clark", mixed_torus),
+    "mixed torus": ("catmull_clark", lambda: cage_of("catmull_clark", "mixed torus")),
     "hexagon": ("catmull_clark", lambda: cage_of("catmull_clark", "hexagon")),
     "valence 2": ("catmull_clark", lambda: cage_of("catmull_clark", "valence 2 beside triangle")),
     "valence 3": ("catmull_clark", lambda: extraordinary(3)),
@@ -41,7 +31,7 @@ SURFACES = {
     "sheet without corners": ("catmull_clark", lambda: sheet(3, 2, boundary="edge_only")),
     "boundary none": ("catmull_clark", lambda: sheet(4, 4, boundary="none")),
     "half disc of 6": ("catmull_clark", lambda: half_disc(6)),
-    "holes": ("catmull_clark", lambda: tagged(mixed_torus(), holes=[0, 3])),
+    "holes": ("catmull_clark", lambda: tagged(cage_of("catmull_clark", "mixed torus"), holes=[0, 3])),
     "non-manifold": ("catmull_clark", lambda: book(3)),
     "dart": ("catmull_clark", lambda: spokes(extraordinary(5, closed=False), 5, (INFINITE,))),
     "crease": ("catmull_clark", lambda: spokes(trapezohedron(6), 6, (INFINITE, 0, INFINITE))),
@@ -53,13 +43,13 @@ SURFACES = {
     "chaikin": ("catmull_clark", lambda: tagged(cube(), creases=UNEQUAL, corners=[(0, 2.4)], crease_method="chaikin")),
     "rook": ("catmull_clark", lambda: ControlCage.from_file(CAGES / "rook.obj")),
     "propeller": ("catmull_clark", lambda: ControlCage.from_file(CAGES / "propeller.obj")),
-    "loop mixed torus": ("loop", lambda: triangulated(mixed_torus())),
+    "loop mixed torus": ("loop", lambda: cage_of("loop", "mixed torus")),
     "loop valence 3": ("loop", lambda: extraordinary_triangles(3)),
     "loop valence 50": ("loop", lambda: upper_half(extraordinary_triangles(50))),
     "loop sheet": ("loop", lambda: sheet(3, 3, triangles=True, boundary="edge_only")),
     "loop half disc of 6": ("loop", lambda: half_disc(6)),
     "loop corner": ("loop", lambda: spokes(upper_half(extraordinary_triangles(5)), 5, (0.5, 1.5, INFINITE))),
-    "doo_sabin mixed torus": ("doo_sabin", mixed_torus),
+    "doo_sabin mixed torus": ("doo_sabin", lambda: cage_of("doo_sabin", "mixed torus")),
     "doo_sabin face of 50": ("doo_sabin", lambda: extraordinary_face(50)),
     "doo_sabin sheet": ("doo_sabin", lambda: sheet(4, 4)),
 }

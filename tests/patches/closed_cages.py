@@ -59,9 +59,9 @@ def extraordinary_face(corners):
     )
 
 
-def circle(n, radius, height, shift=0.0):
+def circle(n, radius=1.0, height=0.0, shift=0.0):
     angle = 2 * np.pi * (np.arange(n) + shift) / n
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(n, height)], axis=1).tolist()
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.full(n, height)], axis=1)
 
 
 def prism(n=5):

@@ -1,11 +1,13 @@
 """Cages with all features of OpenSubdiv, alone and together, small enough for deep refinement."""
 
+from itertools import pairwise
+
 import numpy as np
 from mitsuba_subdivision import Attribute, ControlCage
 from mitsuba_subdivision.cage import named_cages
 from mitsuba_subdivision.cage.errors import without_warnings
 from patches import closed_cages
-from patches.closed_cages import bumpy, polygons, tetrahedron
+from patches.closed_cages import bumpy, circle, polygons, tetrahedron
 from reference.refined_cages import changed, half_disc, sheet, tagged
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -22,13 +24,8 @@ def made(positions, faces, **options):
         return bumpy(ControlCage(positions, faces, **options), seed=1)
 
 
-def circle(count):
-    turn = 2 * np.pi * np.arange(count) / count
-    return np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
-
-
-def halved(quads):
-    return [half for a, b, c, d in quads for half in ([a, b, c], [a, c, d])]
+def triangulated(faces):
+    return [(face[0], a, b) for face in faces for a, b in pairwise(face[1:])]
 
 
 def edges_of(face):
@@ -230,7 +227,7 @@ def book(pages, triangles=False, **options):
             faces += [[before[i], before[i + 1], here[i + 1], here[i]] for i in range(3)]
             before = here
     if triangles:
-        faces, options["scheme"] = halved(faces), "loop"
+        faces, options["scheme"] = triangulated(faces), "loop"
     return made(positions, faces, **options)
 
 
@@ -258,7 +255,7 @@ def pole(count, triangles=False, **options):
     quads = [[here, here + count, ahead + count, ahead] for here, ahead in ring]
     tip = [[0, 0, here, ahead] for here, ahead in ring]
     if triangles:
-        quads, tip, options["scheme"] = halved(quads), halved(tip), "loop"
+        quads, tip, options["scheme"] = triangulated(quads), triangulated(tip), "loop"
     positions = np.vstack([[[0, 0, 1]], circle(count), 2 * circle(count) - [0, 0, 1]])
     return made(positions, [*quads, *tip], **options)
 

@@ -8,6 +8,9 @@ from reference.refined_cages import tagged
 
 # Around the top of the cube, of edges that are sharp and of semi-sharp ones.
 RING = [(0, 1, 10), (1, 3, 10), (3, 2, 10), (2, 0, 10)]
+# Places a shape, which it shears.
+SHEARED = np.array([[1.2, 0.3, 0.0, 2.0], [0.0, 0.7, 0.2, -1.0], [0.1, 0.0, 1.5, 0.5], [0, 0, 0, 1]])
+MIRRORED = np.diag([-1, 1, 1, 1]) @ SHEARED
 # Texture coordinates of the cube: each face is an island.
 ISLANDS = Attribute(np.tile([[0.0, 0], [1, 0], [1, 1], [0, 1]], (6, 1)), "face_varying")
 

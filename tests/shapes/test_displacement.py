@@ -10,7 +10,7 @@ from mitsuba_subdivision.shapes.displacement import TextureHeights
 from patches.closed_cages import extraordinary_triangles
 from reference.refined_cages import tagged
 from scipy import ndimage
-from shapes.cages import RING, bitmap, cube, load
+from shapes.cages import MIRRORED, RING, SHEARED, bitmap, cube, load
 from shapes.scenes import buffer, camera_rays, scene_with, vertices, waves
 from shapes.updates import differentiated, moving, update
 from shapes.variants import every_ad_variant, every_variant, exact, exact_llvm
@@ -32,8 +32,6 @@ IMAGE = np.random.default_rng(7).random((5, 8)).astype(np.float32)
 # Of a bitmap's texture coordinates, turned and sheared; and of its three channels, whose luminance is the height.
 TO_UV = np.array([[1.22, -0.34, 0.0], [0.36, 0.89, 0.0], [0.0, 0.0, 1.0]])
 CHANNELS, LUMINANCE = np.array([0.5, 1.0, 1.5]), np.array([0.212671, 0.715160, 0.072169])
-MATRIX = np.array([[1.2, 0.3, 0.0, 2.0], [0.0, 0.7, 0.2, -1.0], [0.1, 0.0, 1.5, 0.5], [0, 0, 0, 1]])
-MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0]) @ MATRIX
 STRETCHED = np.diag([-1.0, 0.8, 1.2, 1.0])
 ADAPTIVE = {"tessellation": "adaptive", "chord_error": 0.03}
 
@@ -128,8 +126,8 @@ def heights(kind):
 @pytest.mark.parametrize(
     ("name", "kind", "to_world"),
     [
-        *((name, "vertex_height", MATRIX) for name in ("creased islands", "dome")),
-        *((name, "bitmap", MIRROR) for name in ("valence 5", "pyramid")),
+        *((name, "vertex_height", SHEARED) for name in ("creased islands", "dome")),
+        *((name, "bitmap", MIRRORED) for name in ("valence 5", "pyramid")),
         *(("creased islands", kind, None) for kind in ("bitmap", "waves")),
         *((name, "vertex_height", None) for name in ("loop", "doo_sabin")),
     ],

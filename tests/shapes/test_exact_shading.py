@@ -10,7 +10,7 @@ from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from patches.closed_cages import cube_with_hexagon, extraordinary_triangles, tetrahedron
 from reference.refined_cages import sheet
 from scipy import ndimage
-from shapes.cages import RING, bitmap, cube, described, textured
+from shapes.cages import MIRRORED, RING, SHEARED, bitmap, cube, described, textured
 from shapes.scenes import camera_rays, perspective, rays, rows, scene_with
 from shapes.variants import llvm
 
@@ -111,10 +111,6 @@ def test_normals_do_not_depend_on_the_tessellation(name):
         is_hit = np.array(si.is_valid())
         for value in (si.p, si.n, si.sh_frame.n, si.uv, si.dp_du, si.dp_dv):
             assert np.isfinite(rows(value)[is_hit]).all()
-
-
-SHEARED = np.array([[1.2, 0.3, 0.0, 2.0], [0.0, 0.7, 0.2, -1.0], [0.1, 0.0, 1.5, 0.5], [0, 0, 0, 1]])
-MIRRORED = np.diag([-1, 1, 1, 1]) @ SHEARED
 
 
 @pytest.mark.parametrize(

@@ -17,14 +17,12 @@ from mitsuba_subdivision.regression.image import load_image
 from mitsuba_subdivision.regression.scene import BOX, load_scene, render_pixels
 from mitsuba_subdivision.shapes import interaction_hook
 from mitsuba_subdivision.shapes.exact_shading import ExactShading
-from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turntable, load_quietly
 from mitsuba_subdivision.studio.cage_scenes import CageScenes, Model
 from mitsuba_subdivision.studio.picture import ERRORS
 from mitsuba_subdivision.studio.studio_entries import Look
+from shapes.variants import exact, llvm, scalar
 
-exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
-llvm, scalar = (pytest.mark.usefixtures(f"variant_{name}") for name in ("llvm_ad_rgb", "scalar_rgb"))
 SCENES = Path(msub.example_file("human.xml")).parent
 SMALL = ["--size", "20x15", "--spp", "4", "--rate", "2", "-m", "scalar_rgb"]
 SCENE = '<scene version="3.0.0"><integrator type="path"/>{}</scene>'

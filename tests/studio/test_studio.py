@@ -14,19 +14,10 @@ from mitsuba_subdivision.cage import CageError, cage_of, named_cages
 from mitsuba_subdivision.cage.errors import CageWarning
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.regression.scene import load_scene
-from mitsuba_subdivision.studio import studio, studio_scene
+from mitsuba_subdivision.studio import studio, studio_entries, studio_scene
 from mitsuba_subdivision.studio.cage_scenes import Model
 from mitsuba_subdivision.studio.saving import save_scene
-from mitsuba_subdivision.studio.studio_entries import (
-    FIELD_OF_VIEW,
-    MARGIN,
-    NEAREST,
-    VIEWS,
-    camera_axes,
-    framed,
-    outermost,
-    sampler,
-)
+from mitsuba_subdivision.studio.studio_entries import MARGIN, NEAREST, VIEWS, camera_axes, framed, outermost, sampler
 
 llvm, scalar = (pytest.mark.usefixtures(f"variant_{name}") for name in ("llvm_ad_rgb", "scalar_rgb"))
 CAGES = Path(msub.example_file("human.xml")).parent / "cages"
@@ -39,7 +30,7 @@ def in_picture(points, origin, axes, size):
     """Places of points, from -1 to 1 in each direction of the picture, by the definition of a perspective camera."""
     x, y, z = ((points - origin) @ axes).T
     assert (z > 0).all()
-    half = np.tan(np.radians(FIELD_OF_VIEW / 2)) * np.array(size) / max(size)
+    half = np.tan(np.radians(studio_entries.FIELD_OF_VIEW / 2)) * np.array(size) / max(size)
     return np.stack([x, y], axis=1) / (z[:, None] * half)
 
 

@@ -4,7 +4,7 @@ from mitsuba_subdivision import CageError, ControlCage, LimitSurface
 from mitsuba_subdivision.mesh.signature import NEAR_FACES
 from mitsuba_subdivision.schemes import CatmullClark, Loop
 from mitsuba_subdivision.surface import arguments
-from peers.fidelity_cages import circle
+from patches.closed_cages import circle
 
 SCHEMES = pytest.mark.parametrize("scheme", ["catmull_clark", "loop", "doo_sabin"])
 HIGH = 200
@@ -81,22 +81,10 @@ def open_fan(count, triangles_only, rng):
     return np.concatenate([rim, [[0, 0, 0.4]], 1.3 * rim[list(quads)]]), faces
 
 
-class WholeCatmullClark(CatmullClark):
-    has_local_borders = False
-
-
-class WholeLoop(Loop):
-    has_local_borders = False
-
-
-@pytest.mark.parametrize(
-    ("scheme", "whole", "corner"),
-    [(CatmullClark(), WholeCatmullClark(), 0), (Loop(), WholeLoop(), 0), (Loop(), WholeLoop(), 10)],
-    ids=["catmull_clark", "loop", "loop corner"],
-)
-def test_far_faces_of_a_fan_have_no_effect(scheme, whole, corner, np_rng, monkeypatch):
+@pytest.mark.parametrize(("rules_of", "corner"), [(CatmullClark, 0), (Loop, 0), (Loop, 10)])
+def test_far_faces_of_a_fan_have_no_effect(rules_of, corner, np_rng, monkeypatch):
     """The surface by the near faces is that by all faces of a fan, and that by the rules, level by level."""
-    count = NEAR_FACES + 5
+    count, scheme, whole = NEAR_FACES + 5, rules_of(), type("Whole", (rules_of,), {"has_local_borders": False})()
     monkeypatch.setattr(arguments, "MOST_DIFFERENT_FACES", count)
     points, faces = open_fan(count, scheme.name == "loop", np_rng)
     cage = ControlCage(points, faces, corners=[[count + 1, corner]] if corner else [])

@@ -29,7 +29,7 @@ def distances(surface, table, most_triangles=6000, most_points=120, seed=0):
     from_own = distances_of_pairs(on_surface, np.repeat(corners[own], len(PLACES), axis=0))
     return (
         _largest(apart, lambda at: surface.closest_point(on_triangles[at]).distance, most_points, random),
-        _largest(from_own, lambda at: _from_all(on_surface[at], corners, from_own[at]), most_points, random),
+        _largest(from_own, lambda at: distances_to(corners, on_surface[at], from_own[at]), most_points, random),
     )
 
 
@@ -43,9 +43,9 @@ def _largest(bounds, exact, most, random):
     return max(largest, exact(rest).max(initial=0)) if len(rest) else largest
 
 
-def _from_all(points, corners, bounds):
+def distances_to(corners, points, bounds=np.inf):
     """``(s,)`` distances of points from the nearest of triangles ``(t, 3, 3)``, which are at most some bounds."""
-    lower, upper, nearest = corners.min(axis=1), corners.max(axis=1), bounds.copy()
+    lower, upper, nearest = corners.min(axis=1), corners.max(axis=1), np.full(len(points), bounds)
     for index, point in enumerate(points):
         from_box = np.linalg.norm(np.maximum(0, np.maximum(lower - point, point - upper)), axis=1)
         near = corners[from_box <= nearest[index]]

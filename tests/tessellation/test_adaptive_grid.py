@@ -12,7 +12,7 @@ from mitsuba_subdivision.tessellation.adaptive import feature_edges
 from mitsuba_subdivision.tessellation.adaptive_grid import PatchFrames
 from mitsuba_subdivision.tessellation.criterion import Criterion
 from patches.closed_cages import bumpy
-from tessellation.distances import distances_of_pairs
+from tessellation.distances import distances_to
 from tessellation.test_attribute_table import EVERY_CAGE, with_seams
 
 # Parameters are sums of fractions of a power of two; points of some tens of products.
@@ -37,12 +37,6 @@ def numbered_edges(triangles):
     """Directed edges, a number for each, and the number of the same edge in the other direction."""
     edges = directed_edges(triangles)
     return edges, edges @ [1 << 32, 1], edges @ [1, 1 << 32]
-
-
-def distances_to(corners, points):
-    """Distances of points from the nearest of triangles ``(t, 3, 3)``, which may have no area."""
-    pairs = ((np.broadcast_to(point, (len(corners), 3)), corners) for point in points)
-    return np.array([distances_of_pairs(*pair).min() for pair in pairs])
 
 
 COARSE, FINE, FINE_AROUND_50 = 3e-2, 2e-3, 1e-2

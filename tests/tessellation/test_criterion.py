@@ -9,18 +9,12 @@ from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.evaluation.polynomials import BernsteinBasis
 from mitsuba_subdivision.schemes.domain import SQUARE
-from mitsuba_subdivision.tessellation.criterion import (
-    BESIDE_OUTLINE,
-    Cone,
-    Criterion,
-    Sensor,
-    least_product,
-)
+from mitsuba_subdivision.tessellation.criterion import BESIDE_OUTLINE, Cone, Criterion, Sensor, least_product
 from patches.closed_cages import bumpy, torus
 from reference.refined_cages import sheet
 from scipy.spatial import ConvexHull
-from tessellation.distances import distances
-from tessellation.test_adaptive_grid import TWO_TRIANGLES, directed_edges, distances_to, size_of, table_of
+from tessellation.distances import distances, distances_to
+from tessellation.test_adaptive_grid import TWO_TRIANGLES, directed_edges, size_of, table_of
 
 # Distances are square roots of sums with rounding errors of this part of the surface's size.
 ROUNDING = 1e-7

@@ -11,11 +11,11 @@ from mitsuba_subdivision.studio.animation import StillPicture
 from mitsuba_subdivision.studio.picture import LEAST_LIGHTS
 from mitsuba_subdivision.studio.studio_entries import Look
 from mitsuba_usd.stage_scenes import StageScenes
+from shapes.variants import scalar
 from usd import stages
 from usd.stages import CUBE, POLYGONS, SQUARE, bound, mesh, moved, prim, told
 from usd.test_stage_frames import CAMERA, LAMP, LENS, RATE, STILL, write
 
-scalar = pytest.mark.usefixtures("variant_scalar_rgb")
 DULL_SKY = prim("DomeLight", "sky", "float inputs:intensity = 0.5")
 
 
@@ -115,11 +115,8 @@ def test_an_environment_is_a_dome_in_place_of_all_lights(tmp_path, axis):
 def test_messages_name_the_studios_additions_and_their_reason(tmp_path, capfd):
     """Lights that are invisible, inactive or without power are none."""
     weak = prim("SphereLight", "weak", "float inputs:intensity = 0")
-    hidden, out = (
-        prim("DomeLight", "sky", 'token visibility = "invisible"'),
-        prim("DiskLight", "out", head="active = false"),
-    )
-    path = write(tmp_path, STILL + weak + hidden + out)
+    hidden = prim("DomeLight", "sky", 'token visibility = "invisible"')
+    path = write(tmp_path, STILL + weak + hidden + prim("DiskLight", "out", head="active = false"))
     assert rendered(path).max() > 0.1
     reasons = "(/weak has no power, /sky is invisible, /out is inactive)"
     added = "the studio's camera and lights are added; --no-studio renders without its lights\n"

@@ -19,8 +19,6 @@ def picture(channel="rgb", name="a.png", to_uv=((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
 GREY = [0.2, 0.5, 0.7]
-
-
 CASES = [
     ("add", "color3", {"in1": GREY, "in2": 0.1}, [0.3, 0.6, 0.8]),
     ("subtract", "float", {"in1": 0.2, "in2": 0.5}, -0.3),

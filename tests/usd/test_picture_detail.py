@@ -17,15 +17,8 @@ from mitsuba_subdivision.mitsuba_mesh import points_at
 from mitsuba_subdivision.srgb import decoded
 from mitsuba_subdivision.studio.cage_scenes import frame_table
 from mitsuba_subdivision.studio.picture import ERRORS, FINEST_RATE, MOST_TRIANGLES, highest_rate, outline_for
-from mitsuba_usd import copies
-from mitsuba_usd.contents import (
-    InstanceContents,
-    MaterialContents,
-    NodeContents,
-    SceneContents,
-    ShapeContents,
-    TextureContents,
-)
+from mitsuba_usd import contents, copies
+from mitsuba_usd.contents import InstanceContents, NodeContents, SceneContents, ShapeContents, TextureContents
 from mitsuba_usd.copies import LARGE, LEAST_INSTANCES, with_copies, with_large_copies
 from mitsuba_usd.picture_detail import TEXELS_PER_PIXEL, segments_of, texels_for_pictures, triangles_for_picture
 from mitsuba_usd.scene_entries import DENSE, Surfaces, subdivision
@@ -306,7 +299,7 @@ def square(side=1.0, uv_side=1.0, to_world=None, *, has_texcoords=True):
 
 
 def needed_for(*shapes, inputs, groups=(), **more):
-    material = MaterialContents("/m", inputs)
+    material = contents.MaterialContents("/m", inputs)
     shapes, *groups = ([replace(shape, material=material) for shape in part] for part in (shapes, *groups))
     return texels_for_pictures(SceneContents(shapes=shapes, groups=groups, **more), [sensor_at(DISTANCE)])
 

@@ -13,7 +13,6 @@ from mitsuba_subdivision.cage import CageError, CageWarning
 from mitsuba_subdivision.files import open_stage
 from mitsuba_subdivision.mitsuba_mesh import with_meshes
 from mitsuba_subdivision.regression.scene import load_scene
-from mitsuba_subdivision.shapes.interaction_hook import hook_problem
 from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turntable
 from mitsuba_subdivision.studio.saving import save_scene
 from mitsuba_subdivision.studio.studio_entries import Look
@@ -21,32 +20,14 @@ from mitsuba_usd import scene_entries, stage_scenes
 from mitsuba_usd.scene_entries import Surfaces
 from mitsuba_usd.stage_scenes import StageScenes
 from mitsuba_usd.stage_walk import StageReader, _StageWalk, is_still
+from shapes.variants import exact, scalar
 from usd import stages
-from usd.stages import (
-    CORNERS,
-    CUBE,
-    FACES,
-    POINTS,
-    POLYGONS,
-    SQUARE,
-    bound,
-    material,
-    mesh,
-    moved,
-    prim,
-    subset,
-    texture,
-    told,
-)
-
-scalar = pytest.mark.usefixtures("variant_scalar_rgb")
+from usd.stages import CUBE, FACES, POINTS, POLYGONS, SQUARE, bound, material, mesh, moved, prim, subset, texture
 
 # Of stages, parts move from time 1 to time 5.
 RAISED = "(-1,-1,-1), (1,-1,-1), (-1,1,-1), (1,1,-1), (-.3,-.3,3), (.3,-.3,3), (-.3,.3,3), (.3,.3,3)"
 COLORS = "(1,0,0), (0,1,0), (0,0,1), (1,1,0), (1,0,1), (0,1,1), (1,1,1), (0,0,0)"
-
-
-MOVING = prim("Mesh", "moving", f"point3f[] points.timeSamples = {{1: [{CORNERS}], 5: [{RAISED}]}}", FACES)
+MOVING = prim("Mesh", "moving", f"point3f[] points.timeSamples = {{1: [{stages.CORNERS}], 5: [{RAISED}]}}", FACES)
 STILL = prim("Mesh", "still", CUBE, moved(translate=(2.6, 0.4, 0)), "color3f[] primvars:displayColor = [(.1,.2,.7)]")
 TINTS = f'color3f[] primvars:displayColor = [{COLORS}] (interpolation = "vertex")'
 TINTED = prim("Mesh", "tinted", CUBE, moved(translate={1: (-2.6, 0, 0), 5: (-2.6, 0, 2)}), TINTS)
@@ -355,7 +336,7 @@ def test_textures_are_as_fine_as_the_most_demanding_frame(sides):
 def test_warnings_of_all_frames_come_once(tmp_path):
     fin = CUBE.replace("4]", "4, 4]", 1).replace("7,5]", "7,5, 0,1,7,6]")
     path = write(tmp_path, prim("Mesh", "fin", fin) + prim("Points", "hair") + LAMP)
-    shown, messages = told(lambda: [*frame_range(path, range(1, 3)).frames([1, 2], "box")])
+    shown, messages = stages.told(lambda: [*frame_range(path, range(1, 3)).frames([1, 2], "box")])
     assert (len(shown), len(messages)) == (2, 2)
     messages.sort(key=len)
     assert "Points are ignored (/hair)" in messages[0]
@@ -379,10 +360,8 @@ def test_shutters_blur_a_moving_square_by_its_time_in_a_pixel(tmp_path):
     moment = np.linspace(0.25, 0.75, 20001)[:, None]
     start = -2 + 2 * moment
     covered = np.clip(np.minimum(start + 1, left + 0.25) - np.maximum(start, left), 0, 0.25).mean(axis=0) / 0.25
-    picture, options = (
-        str(tmp_path / "a.exr"),
-        "--size 16x8 --spp 64 --filter box -m scalar_rgb --time 0.5 --shutter 16",
-    )
+    picture = str(tmp_path / "a.exr")
+    options = "--size 16x8 --spp 64 --filter box -m scalar_rgb --time 0.5 --shutter 16"
     assert main(["render", str(crossing(tmp_path, -0.25, 0.25)), "-o", picture, *options.split()]) == 0
     image = np.array(mi.Bitmap(picture))[..., 1]
     # Each sub-frame has 4 samples in a row of the pixel, of which an edge of the square may hit one more or fewer.
@@ -404,10 +383,6 @@ def test_shutters_need_a_time_and_an_open_interval(tmp_path, capsys):
         assert message in capsys.readouterr().err
     with pytest.warns(CageWarning, match="shutters of cameras have no effect without"):
         StillPicture(StageScenes(crossing(tmp_path, 0, 0.5), LOOK, RATE))
-
-
-# Shading and triangles that whole stages have by default.
-exact = pytest.mark.skipif(hook_problem() is not None, reason=str(hook_problem()))
 
 
 @pytest.fixture

@@ -288,10 +288,8 @@ def test_ignored_velocities_warn_between_samples(stage):
     path = stage(mesh("cube", f"point3f[] points.{samples}", faces, f"vector3f[] velocities.{samples}"))
     for time, count in ((None, 0), (1, 0), (1.5, 1), (2, 0), (3, 1)):
         _, messages = told(StageReader(path).at, time)
-        assert [
-            m for m in messages if "velocities of meshes are ignored; their points are interpolated" in m
-        ] == messages
         assert len(messages) == count
+        assert all("velocities of meshes are ignored; their points are interpolated" in line for line in messages)
 
 
 def test_invisible_instances_do_not_hide_others(scene):
@@ -1046,9 +1044,8 @@ def test_colours_with_alpha_are_colours(stage, kind, binding, interpolation):
     text = material("color3f inputs:diffuseColor.connect = </paint/r.outputs:result>", reader) + CAMERA + SKY
     path = stage(text + mesh("square", SQUARE, f'{colors} (interpolation = "{interpolation}")', binding))
     entries, (message,) = told(msub.usd_scene, path, mi, size=(4, 4))
-    assert message.endswith(
-        "alpha of colours is ignored; expected a primvar of its own (/square.primvars:displayColor)"
-    )
+    assert "alpha of colours is ignored; expected a" in message
+    assert message.endswith(" primvar of its own (/square.primvars:displayColor)")
     picture = rendered(entries, 256).mean(axis=(0, 1))
     np.testing.assert_allclose(picture / picture[0], [1, 0.5, 0.25], atol=0.08)  # With white reflections
 
