@@ -461,6 +461,13 @@ def test_another_version_works_if_nothing_has_moved(monkeypatch):
     assert hit(make(), *TOP).is_valid()
 
 
+@pytest.mark.usefixtures("variants_array_rgb", "no_hooks")
+def test_shapes_load_without_value_numbering(monkeypatch):
+    monkeypatch.setattr(interaction_hook.InteractionHook, "_tag_groups", lambda _: None)
+    with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, False):
+        assert hit(make(), *TOP).is_valid()
+
+
 def triangle_with(name, changed):
     """Triangles of the trial with another override, which a function makes of the right one."""
     make = interaction_hook._triangle

@@ -160,7 +160,8 @@ class InteractionHook:
             entries[index] = calling_after(entries[index], result_type, self._attribute(result_type, sizes))
         self._table = (ctypes.c_void_p * len(entries))(*entries)
         self.attach(triangle, triangle)
-        problem = trial_problem(variant, triangle)
+        with dr.scoped_set_flag(dr.JitFlag.ValueNumbering):  # Equal literals are one variable, as the trial compares them
+            problem = trial_problem(variant, triangle)
         if problem is not None:
             raise RuntimeError(f"needs the virtual functions of Mitsuba 3.9; of those of {mi.__version__}, {problem}")
         self._tag_groups()
