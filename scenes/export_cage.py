@@ -3,9 +3,8 @@
     blender -b model.blend --python export_cage.py -- model.usda
     blender -b model.blend --python export_cage.py -- model.obj --object Chair
 
-Each function of ``MENDS`` mends faults of the exporter of Blender 4.5.1 and 5.0.1, which its docstring names, and goes
-where Blender mends them. Above all, an object with a Subdivision Surface modifier becomes its cage: the mesh that the
-last such modifier gets, with the modifiers above it applied and those below it left out.
+Functions of ``MENDS`` mend faults of Blender 4.5.1 and 5.0.1, which their docstrings name. Above all, an object with a
+Subdivision Surface modifier becomes its cage: the mesh that the last such modifier gets.
 
 As an add-on (Preferences, Add-ons, Install from Disk), this file mends what File > Export writes. As a script it needs
 Blender 4.5 or newer, or the option --blend and a Python that has the package bpy.
@@ -48,6 +47,7 @@ BLENDS = {"ADD": "plus", "SUBTRACT": "minus", "SCREEN": "screen", "OVERLAY": "ov
 DOME = mathutils.Matrix(((0, 0, 1), (1, 0, 0), (0, 1, 0)))
 OBJECT_NAME, DATA_NAME = "userProperties:blender:object_name", "userProperties:blender:data_name"
 KINDS = Sdf.ValueTypeNames
+ALWAYS = dict.fromkeys(("generate_materialx_network", "allow_unicode", "overwrite_textures"), True)
 
 
 @functools.cache  # Once.
@@ -65,6 +65,7 @@ class Export:
         self.is_animated, self.values, self.written = stage.HasAuthoredTimeCodeRange(), {}, {}
         found = [prim for prim in stage.Traverse() if prim.IsA(UsdShade.Material) and prim.HasAttribute(DATA_NAME)]
         self.materials = {prim.GetAttribute(DATA_NAME).Get(): UsdShade.Material(prim) for prim in found}
+        self.has_materials = found or not any(thing.material_slots for thing in bpy.data.objects)
         # Prims of objects themselves, by name; others with the name of an object are its instances.
         self.own, self.others, parents = {}, [], {self.root.GetPath(): None}
         for prim, thing in [(prim, _object_of(prim)) for prim in Usd.PrimRange(self.root) if _object_of(prim)]:
@@ -78,9 +79,8 @@ class Export:
         for mend in MENDS:
             mend(self)
         before = self.scene.frame_current, self.scene.frame_subframe
-        frames = range(int(self.stage.GetStartTimeCode()), int(self.stage.GetEndTimeCode()) + 1)
-        for frame in frames if self.is_animated else [None]:
-            if frame is not None:
+        for frame in range(int(self.stage.GetStartTimeCode()), int(self.stage.GetEndTimeCode()) + 1):
+            if self.is_animated:
                 self.time = Usd.TimeCode(frame)
                 self.scene.frame_set(frame)
                 self.depsgraph.update()
@@ -90,7 +90,6 @@ class Export:
             self.scene.frame_set(before[0], subframe=before[1])
 
     def put(self, attribute, value):
-        # It has samples from the frame on before which it moves.
         path = attribute.GetPath()
         if isinstance(value, np.ndarray):
             width, is_integer = value.shape[1] if value.ndim == 2 else 1, value.dtype.kind == "i"
@@ -100,7 +99,7 @@ class Export:
             attribute.Clear()
             attribute.Set(value)
         old, time, moves = self.values.get(path, (value, None, False))
-        if old != value and not moves:
+        if old != value and not moves:  # It has samples from the frame on before which it moves.
             attribute.Set(old, time)
         if moves or old != value:
             attribute.Set(value, self.time)
@@ -134,12 +133,11 @@ def _write_cage(export, path, thing):
         if not is_shown:
             evaluated = thing.evaluated_get(export.depsgraph)
             mesh = evaluated.to_mesh(preserve_all_data_layers=True, depsgraph=export.depsgraph)
-            write_mesh(export, path, mesh, [slot.material for slot in evaluated.material_slots], thing.name, modifier)
+            _write_mesh(export, path, mesh, [slot.material for slot in evaluated.material_slots], thing.name, modifier)
             evaluated.to_mesh_clear()
 
 
-def write_mesh(export, path, mesh, slots, name, modifier=None):
-    """Write a mesh; with a modifier as a cage, otherwise as polygons with normals."""
+def _write_mesh(export, path, mesh, slots, name, modifier=None):
     usd, corners = UsdGeom.Mesh.Define(export.stage, path), _values(mesh.loops, "vertex_index", np.int32)
     primvars = UsdGeom.PrimvarsAPI(usd)
     if path not in export.written:
@@ -181,8 +179,7 @@ def _values(items, name, kind=np.float32, width=1):
 
 
 def _bind(export, usd, faces, slots):
-    # A face whose slot is missing has the last one, as in Blender.
-    faces = np.minimum(faces, max(len(slots) - 1, 0))
+    faces = np.minimum(faces, max(len(slots) - 1, 0))  # One whose slot is missing has the last, as in Blender.
     used, api = np.unique(faces) if slots else (), UsdShade.MaterialBindingAPI.Apply(usd.GetPrim())
     usd.CreateDisplayColorAttr([(0.8, 0.8, 0.8)])  # Of faces without a material.
     for slot in (slot for slot in used if slots[slot]):
@@ -191,19 +188,35 @@ def _bind(export, usd, faces, slots):
             part, these = f"{Tf.MakeValidIdentifier(name)}_{slot}", np.flatnonzero(faces == slot).astype(np.int32)
             subset = api.CreateMaterialBindSubset(part, Vt.IntArray.FromNumpy(these))
             target = UsdShade.MaterialBindingAPI.Apply(subset.GetPrim())
+        if name not in export.materials and export.has_materials:
+            _write_material(export, slots[slot].original)
         if name in export.materials:
             target.Bind(export.materials[name])
-        elif export.materials:
-            _warn(f'material "{name}" is left out, as no slot of an object has it')
+
+
+def _write_material(export, material):
+    # Geometry nodes set materials that no slot has, and Blender's exporter writes those of slots: of another scene.
+    layer, scene, mesh = export.stage.GetRootLayer(), bpy.data.scenes.new("Slot"), bpy.data.meshes.new("Slot")
+    part, thing = pathlib.Path(layer.realPath).with_suffix(".slot.usda"), bpy.data.objects.new("Slot", mesh)
+    mesh.materials.append(material)
+    scene.collection.objects.link(thing)
+    with bpy.context.temp_override(scene=scene, view_layer=scene.view_layers[0]):
+        root = str(export.root.GetPath())
+        bpy.ops.wm.usd_export(filepath=str(part), evaluation_mode="RENDER", root_prim_path=root, **ALWAYS)
+    stage = Usd.Stage.Open(str(part))
+    path = next(prim.GetPath() for prim in stage.Traverse() if prim.IsA(UsdShade.Material))
+    UsdGeom.Scope.Define(export.stage, path.GetParentPath())
+    Sdf.CopySpec(stage.GetRootLayer(), path, layer, path)
+    export.materials[material.name] = UsdShade.Material.Get(export.stage, path)
+    bpy.data.batch_remove([scene, thing, mesh])
+    part.unlink()
 
 
 def _creases(mesh, used, modifier, may_move):
-    # As Blender hands them to OpenSubdiv: the sharpness is ten times the square of the crease.
     edges = _values(mesh.edges, "vertices", np.int32, 2)
     found = [modifier.use_creases and mesh.attributes.get(f"crease_{domain}") for domain in ("edge", "vert")]
-    sharpness, corners = np.zeros(len(edges)), np.zeros(len(mesh.vertices))
-    for values, each in zip((sharpness, corners), found, strict=True):
-        values[:] = 10 * _values(each.data, "value", float) ** 2 if each else 0
+    sizes = zip(found, (len(edges), len(mesh.vertices)), strict=True)
+    sharpness, corners = (10 * _values(each.data, "value", float) ** 2 if each else np.zeros(n) for each, n in sizes)
     has_face = np.isin(np.arange(len(edges)), _values(mesh.loops, "edge_index", np.int32))
     # So that a plane with four creases keeps its corners: the last value that is assigned is the least.
     order = np.flatnonzero(has_face)[np.argsort(-sharpness[has_face], kind="stable")]
@@ -212,8 +225,7 @@ def _creases(mesh, used, modifier, may_move):
     corners += np.where(valence == 2, least, 0)
     corners[edges[~has_face]] = INFINITE
     corners = np.minimum(corners[used], INFINITE)
-    # Arrays of another length at the next frame are not interpolated.
-    floor = -1 if may_move and any(found) else 0
+    floor = -1 if may_move and any(found) else 0  # Arrays of another length at the next frame are not interpolated.
     sharp, creased = np.flatnonzero(corners > floor), has_face & (sharpness > floor)
     indices = np.searchsorted(used, edges[creased]).ravel()
     return indices, np.full(len(indices) // 2, 2), sharpness[creased], sharp, corners[sharp]
@@ -225,9 +237,8 @@ def meshes(export):
     Corners of two edges are smooth. Instances of geometry nodes have the mesh of their owner, bevelled curves none.
     """
     if not export.written:
-        geometry = [prim for prim in Usd.PrimRange(export.root) if prim.IsA(UsdGeom.Gprim)]
-        for prim in geometry + export.others[::-1]:
-            if prim in geometry or not prim.GetChildren():
+        for prim in [each for each in Usd.PrimRange(export.root) if each.IsA(UsdGeom.Gprim)] + export.others[::-1]:
+            if prim.IsA(UsdGeom.Gprim) or not prim.GetChildren():
                 export.stage.RemovePrim(prim.GetPath())
     smooth, names, numbers = {}, {}, {}
     for each in export.depsgraph.object_instances:
@@ -250,7 +261,7 @@ def meshes(export):
                 smooth[path] = thing
             else:
                 slots = [*data.materials] if is_own else [slot.material for slot in each.object.material_slots]
-                write_mesh(export, path, data, slots, thing.name)
+                _write_mesh(export, path, data, slots, thing.name)
         if each.is_instance:
             number = numbers[owner, names[key]] = numbers.get((owner, names[key]), -1) + 1
             path = owner.GetPath().AppendChild(f"{names[key].name.removeprefix('_class_')}_{number}")
@@ -259,8 +270,7 @@ def meshes(export):
             place.GetPrim().SetInstanceable(True)
             export.written[path] = export.time
             export.put_matrix(place, frame.inverted() @ each.matrix_world)
-    # Now that all are seen, as cages change the evaluated scene.
-    for path, thing in smooth.items():
+    for path, thing in smooth.items():  # Now that all are seen, as cages change the evaluated scene.
         _write_cage(export, path, thing)
     for path in [path for path, time in export.written.items() if time is not None and export.is_animated]:
         visibility = UsdGeom.Imageable.Get(export.stage, path).CreateVisibilityAttr()
@@ -339,13 +349,11 @@ def lights(export):
             color *= mathutils.Vector(node.inputs["Color"].default_value[:3])
         values = {"color": Gf.Vec3f(*color), "intensity": intensity, "exposure": light.exposure}
         values |= {"normalize": True, "enableColorTemperature": False}
-        # Lights other than areas are not scaled with their objects.
-        shape = thing.matrix_world.inverted_safe() @ thing.matrix_world.normalized()
+        shape = thing.matrix_world.inverted_safe() @ thing.matrix_world.normalized()  # Only areas are scaled.
         if light.type == "AREA":
             shape = mathutils.Matrix.Diagonal((1, light.size_y / light.size if light.shape == "ELLIPSE" else 1, 1, 1))
             left += ["its spread"] * (light.spread < 3.14159) + ["that it is a portal"] * light.cycles.is_portal
-        elif light.type == "SPOT":
-            # Blender blends by cosines, USD by angles; both ends are the same.
+        elif light.type == "SPOT":  # Blender blends by cosines, USD by angles; both ends are the same.
             half, edge = light.spot_size / 2, math.cos(light.spot_size / 2)
             inner = math.acos(min(edge + (1 - edge) * light.spot_blend, 1))
             values["shaping:cone:softness"] = 1 - inner / half
@@ -373,12 +381,11 @@ def world(export):
         dome = UsdLux.DomeLight.Define(export.stage, path)
         export.put(dome.CreateIntensityAttr(), node.inputs["Strength"].default_value if node else 1.0)
         export.put(dome.CreateColorAttr(), color)
-        if texture:
-            dome.SetXformOpOrder([])
-            export.put_matrix(dome, (turn @ DOME).to_4x4())
-        else:
+        dome.SetXformOpOrder([])
+        export.put_matrix(dome, ((turn or mathutils.Matrix.Identity(3)) @ DOME).to_4x4())
+        if not texture:
             dome.GetPrim().RemoveProperty("inputs:texture:file")
-        if texture and (texture.image.colorspace_settings.name == "sRGB") == texture.image.is_float:
+        elif (texture.image.colorspace_settings.name == "sRGB") == texture.image.is_float:
             _warn(f'world "{source.name}": its image is taken as sRGB if it has eight bits, and else as linear')
 
 
@@ -419,9 +426,9 @@ def materials(export):
                 _connect_attribute(name, each, material, surface)
             if each.type == "MIX" and each.data_type == "RGBA" and each.blend_type != "MIX":
                 _blend(material, each, _shader(material, each))
-        shaders = [each for each in Usd.PrimRange(material.GetPrim()) if each.IsA(UsdShade.Shader)]
-        for shader in map(UsdShade.Shader, shaders):
-            if shader.GetShaderId() == "ND_heighttonormal_vector3" and (scale := shader.GetInput("scale")).Get():
+        for prim in Usd.PrimRange(material.GetPrim()):
+            is_bump = prim.GetAttribute("info:id").Get() == "ND_heighttonormal_vector3"
+            if is_bump and (scale := prim.GetAttribute("inputs:scale")).Get():
                 scale.Set(16 * scale.Get())  # MaterialX divides slopes by 16.
 
 
@@ -494,9 +501,7 @@ def _copy_input(given, shader, name):
     Sdf.CopySpec(layer, given.GetAttr().GetPath(), layer, path)
 
 
-class CageHook(bpy.types.USDHook):
-    """Blender calls it with the stage that it wrote."""
-
+class _CageHook(bpy.types.USDHook):  # Blender calls it with the stage that it wrote.
     bl_idname, bl_label = "export_cage", "Mends of cages"
 
     @staticmethod
@@ -509,7 +514,7 @@ class CageHook(bpy.types.USDHook):
 
 
 MENDS, MENDS_OF_FRAMES = (told, materials), (meshes, cameras, lights, world)
-register, unregister = bpy.utils.register_classes_factory((CageHook,))
+register, unregister = bpy.utils.register_classes_factory((_CageHook,))
 
 
 def _obj_text(mesh):
@@ -530,10 +535,9 @@ def _obj_text(mesh):
     # Faces of a mesh that its transform mirrors are turned over, so that they are counter-clockwise from outside.
     step = -1 if np.linalg.det(matrix) < 0 else 1
     lines += ["f " + " ".join(texts[start:end][::step]) for start, end in zip(starts, ends, strict=True)]
-    edges = np.reshape(mesh.GetCreaseIndicesAttr().Get(), (-1, 2)).astype(int).tolist()
-    creased = zip(edges, mesh.GetCreaseSharpnessesAttr().Get(), strict=True)
+    edges, values = np.reshape(mesh.GetCreaseIndicesAttr().Get(), (-1, 2)), mesh.GetCreaseSharpnessesAttr().Get()
     sharp = zip(mesh.GetCornerIndicesAttr().Get(), mesh.GetCornerSharpnessesAttr().Get(), strict=True)
-    lines += [f"t crease 2/1/0 {start} {end} {sharpness!r}" for (start, end), sharpness in creased]
+    lines += [f"t crease 2/1/0 {start} {end} {value!r}" for (start, end), value in zip(edges, values, strict=True)]
     lines += [f"t corner 1/1/0 {vertex} {sharpness!r}" for vertex, sharpness in sharp]
     boundary, rule = mesh.GetInterpolateBoundaryAttr().Get(), mesh.GetFaceVaryingLinearInterpolationAttr().Get()
     lines.append(f"t interpolateboundary 1/0/0 {[*BOUNDARY.values()].index(boundary)}")
@@ -541,8 +545,7 @@ def _obj_text(mesh):
     return "\n".join(lines) + "\n"
 
 
-def export_file(arguments):
-    """Write the scene that is open."""
+def _export_file(arguments):
     parser = argparse.ArgumentParser("export_cage.py", description="Export a Blender scene with its control cages.")
     parser.add_argument("output", help="file to write: .usda, .usdc or .obj")
     parser.add_argument("--object", help="write only this object; needed for OBJ if there are several")
@@ -557,14 +560,11 @@ def export_file(arguments):
         sys.exit(f"export_cage: {options.output}: No such file or directory")
     if options.blend:
         bpy.ops.wm.open_mainfile(filepath=options.blend)
-    # Beside the file and renamed, so that there is never half of one.
-    part = output.with_suffix(f".part{'.usda' if is_obj else output.suffix}")
-    # Instead of skeletons and blended shapes, the vertices of each frame.
-    kinds = dict.fromkeys(("export_armatures", "export_shapekeys"), False)
-    kinds |= dict.fromkeys(("export_materials", "convert_world_material", "generate_materialx_network"), not is_obj)
-    kinds |= {"allow_unicode": True, "overwrite_textures": True, "export_animation": options.animation}
+    part = output.with_suffix(f".part{'.usda' if is_obj else output.suffix}")  # Renamed: there is never half a file.
+    kinds = ALWAYS | dict.fromkeys(("export_armatures", "export_shapekeys"), False)  # But their vertices.
+    kinds |= dict.fromkeys(("export_materials", "convert_world_material"), not is_obj)
     try:
-        bpy.ops.wm.usd_export(filepath=str(part), evaluation_mode="RENDER", **kinds)
+        bpy.ops.wm.usd_export(filepath=str(part), evaluation_mode="RENDER", export_animation=options.animation, **kinds)
         stage = Usd.Stage.Open(str(part))
         prims = Usd.PrimRange(stage.GetDefaultPrim(), Usd.TraverseInstanceProxies())
         found = [(prim.GetAttribute(OBJECT_NAME).Get(), UsdGeom.Mesh(prim)) for prim in prims if prim.IsA(UsdGeom.Mesh)]
@@ -593,8 +593,8 @@ def export_file(arguments):
 if __name__ == "__main__":
     register()
     try:
-        export_file(sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:])
+        _export_file(sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:])
     except Exception as error:
         sys.exit(f"export_cage: {error}")  # Blender itself would end with 0.
     finally:
-        unregister()
+        unregister()  # Else Blender 4.5 does not end.

@@ -242,7 +242,9 @@ def make_shown(model):
     hairs = cube("emitter", "PARTICLE_SYSTEM")[1].particle_system.settings
     hairs.type, hairs.count, hairs.render_type, hairs.instance_object = "HAIR", 5, "OBJECT", part
     # Geometry nodes that instance a cube at three points of a line.
-    group, line, on_points, _ = geometry_nodes("MeshLine", "InstanceOnPoints")
+    group, line, on_points, paint, _ = geometry_nodes("MeshLine", "InstanceOnPoints", "SetMaterial")
+    paint.inputs["Material"].default_value = bpy.data.materials.new("Set")
+    fill(tree_of(bpy.data.materials["Set"]).nodes["Principled BSDF"], {**DULL, "Base_Color": (0.9, 0.2, 0.1, 1.0)})
     line.inputs["Count"].default_value = 3
     group.links.new(group.nodes.new("GeometryNodeMeshCube").outputs["Mesh"], on_points.inputs["Instance"])
     cube("nodes", "NODES")[1].node_group = group
