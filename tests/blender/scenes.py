@@ -268,6 +268,8 @@ def make_shown(model):
     group, _, store, _ = geometry_nodes("NodeGroupInput", "StoreNamedAttribute")
     store.domain, store.inputs["Name"].default_value = "EDGE", "crease_edge"
     cube("creased", "NODES", "SUBSURF")[1].node_group = group
+    bpy.context.view_layer.objects.active = cube("carved", "MULTIRES")[0]
+    bpy.ops.object.multires_subdivide(modifier="Multires")
     camera = aim("Camera", None, (0, -30, 0), (math.pi / 2, 0, 0), type="ORTHO")
     sun = aim("Sun", "SUN", rotation=(0.9, 0.3, 0), angle=0.01)
     scene.render.use_motion_blur, scene.render.motion_blur_shutter = True, 0.5
