@@ -160,7 +160,7 @@ class InteractionHook:
             entries[index] = calling_after(entries[index], result_type, self._attribute(result_type, sizes))
         self._table = (ctypes.c_void_p * len(entries))(*entries)
         self.attach(triangle, triangle)
-        with dr.scoped_set_flag(dr.JitFlag.ValueNumbering):  # Equal literals are one variable, as the trial compares them
+        with dr.scoped_set_flag(dr.JitFlag.ValueNumbering):  # Equal literals are then one variable, as compared below
             problem = trial_problem(variant, triangle)
         if problem is not None:
             raise RuntimeError(f"needs the virtual functions of Mitsuba 3.9; of those of {mi.__version__}, {problem}")
