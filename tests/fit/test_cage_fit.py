@@ -121,6 +121,7 @@ def test_other_parameters_are_found():
     np.testing.assert_allclose(fit.control_points, cube().positions, atol=0.03)
 
 
+@pytest.mark.long
 def test_colours_at_the_cage_are_found_and_refined():
     colours = np.random.default_rng(4).random((8, 3))
     plain, target = (tagged(cube(), attributes={"colour": values}) for values in (np.full((8, 3), 0.5), colours))

@@ -48,13 +48,16 @@ VERTEX = [("cube", (*PLACED, *VALUES), {}), ("loop", ("to_world",), {})]
 EXACT = [
     VERTEX[0],
     ("refined", VALUES, {}),
-    *((scheme, (*PLACED, "cage_texcoords"), {}) for scheme in ("loop", "doo_sabin")),
     ("loop", (*PLACED, *VALUES, SCALE), HEIGHTS),
-    ("doo_sabin", ("control_points", SCALE), HEIGHTS),
     ("cube", ("displacement.data",), {**HEIGHTS, "displacement": "bitmap"}),
 ]
-# Of what others have as well, alone.
-ALONE = [VERTEX[1], *(("cube", (name,), HEIGHTS) for name in (SCALE, "cage_weight"))]
+# The same parameters alone, or for another scheme.
+REPEATED = [
+    VERTEX[1],
+    *(("cube", (name,), HEIGHTS) for name in (SCALE, "cage_weight")),
+    *((scheme, (*PLACED, "cage_texcoords"), {}) for scheme in ("loop", "doo_sabin")),
+    ("doo_sabin", ("control_points", SCALE), HEIGHTS),
+]
 
 
 @llvm
@@ -63,7 +66,7 @@ ALONE = [VERTEX[1], *(("cube", (name,), HEIGHTS) for name in (SCALE, "cage_weigh
     [
         *(("vertex", *case) for case in VERTEX),
         *(pytest.param("exact", *case, marks=exact) for case in EXACT),
-        *(pytest.param("exact", *case, marks=[exact, pytest.mark.long]) for case in ALONE),
+        *(pytest.param("exact", *case, marks=[exact, pytest.mark.long]) for case in REPEATED),
     ],
     indirect=["named"],
 )

@@ -261,6 +261,7 @@ SHOWN = [
 ]
 
 
+@pytest.mark.long
 def test_materials_look_the_same_at_every_rate():
     """All in one picture, far from each other and each before a sensor of its own: one kernel for all."""
 
