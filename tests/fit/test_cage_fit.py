@@ -59,6 +59,7 @@ def test_a_box_is_found_from_a_cube(views):
     np.testing.assert_allclose(*sizes, rtol=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("refinements", "least", "most"), [(0, 0.9, 1.0), (2, 0.0, 0.5)])
 def test_smoothing_damps_opposed_motions_of_neighbours_in_dense_cages_only(views, refinements, least, most):
     """Here, to give up random displacements, for a regularizer beside which pictures do not count."""
@@ -87,6 +88,7 @@ def test_collapsing_steps_and_infinite_losses_are_errors(views):
     np.testing.assert_allclose(fit.control_points, cube().positions, atol=ROUNDING)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("integrator", ["prb", "prb_projective"])
 def test_any_differentiable_integrator_can_fit(views, integrator):
     """Without outlines, `prb` knows less, but of the same scene."""

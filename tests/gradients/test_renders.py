@@ -17,7 +17,7 @@ SINGLE = 1e-4
 RATE = 2
 CASES = [
     # Each kind of shading in both modes once: of the other kernels, compiling takes longest.
-    ("rough", "vertex", False),
+    pytest.param("rough", "vertex", False, marks=pytest.mark.long),
     ("textured", "vertex", True),
     pytest.param("textured", "exact", True, marks=exact),
     pytest.param("rough", "exact", False, marks=[exact, pytest.mark.long]),

@@ -190,11 +190,13 @@ SMALL = {
 # And order of derivatives. Hits and nearest points from where they are: then nothing but rounding is left after more
 # steps.
 DIFFERENTIATED = [
-    *(("evaluate", name, 2) for name in ("polygons", "triangles", "doo_sabin")),
+    *(("evaluate", name, 2) for name in ("polygons", "doo_sabin")),
     *(("evaluate", name, 1) for name in ("control points of its own", "border")),
-    *(("intersect", *case) for case in (("polygons", 2), ("triangles", 2), ("border", 1))),
-    *(("closest", name, 1) for name in ("control points of its own", "sheet", "half disc of 6", "loop sheet")),
+    *(("intersect", *case) for case in (("triangles", 2), ("border", 1))),
+    *(("closest", name, 1) for name in ("control points of its own", "sheet", "half disc of 6")),
 ]
+LIKE_THESE = ("evaluate", "triangles", 2), ("intersect", "polygons", 2), ("closest", "loop sheet", 1)
+DIFFERENTIATED += [pytest.param(*case, marks=pytest.mark.long) for case in LIKE_THESE]
 
 
 @pytest.mark.parametrize(("kind", "name", "order"), DIFFERENTIATED)

@@ -48,7 +48,6 @@ VERTEX = [("cube", (*PLACED, *VALUES), {}), ("loop", ("to_world",), {})]
 EXACT = [
     VERTEX[0],
     ("refined", VALUES, {}),
-    ("loop", (*PLACED, *VALUES, SCALE), HEIGHTS),
     ("cube", ("displacement.data",), {**HEIGHTS, "displacement": "bitmap"}),
 ]
 # The same parameters alone, or for another scheme.
@@ -56,6 +55,7 @@ REPEATED = [
     VERTEX[1],
     *(("cube", (name,), HEIGHTS) for name in (SCALE, "cage_weight")),
     *((scheme, (*PLACED, "cage_texcoords"), {}) for scheme in ("loop", "doo_sabin")),
+    ("loop", (*PLACED, *VALUES, SCALE), HEIGHTS),
     ("doo_sabin", ("control_points", SCALE), HEIGHTS),
 ]
 

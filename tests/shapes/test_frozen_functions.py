@@ -81,7 +81,7 @@ def test_updates_inside_of_a_frozen_function_are_recorded(shading, by, given):
         ("vertex", (*SURFACE, "displacement_scale", *COLOURS), DISPLACED, False),
         pytest.param("exact", (*SURFACE, *COLOURS), {}, False, marks=exact),
         ("vertex", ("cage_colour",), {}, True),
-        pytest.param("exact", ("cage_colour",), {}, True, marks=exact),
+        pytest.param("exact", ("cage_colour",), {}, True, marks=[exact, pytest.mark.long]),
     ],
 )
 def test_frozen_gradients_equal_plain_ones(shading, by, given, is_whole):

@@ -283,6 +283,7 @@ def test_instances_evaluate_only_shapes_of_their_group(asked):
 
 
 @llvm
+@pytest.mark.long
 def test_instances_of_groups_side_by_side_are_as_placed_shapes():
     """Points, normals and their derivatives, of exact and of other shapes; in a frozen function, too."""
     x = np.linspace(-0.7, 0.7, 60, dtype=np.float32)
