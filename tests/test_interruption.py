@@ -1,5 +1,6 @@
 import fcntl
 import os
+import re
 import shutil
 import signal
 import struct
@@ -104,6 +105,7 @@ def test_ctrl_c_ends_a_render(tmp_path, shading, seconds, words, variant, reques
     while b"interrupted" not in said:
         said += os.read(mine, 1000)
     os.close(mine)
-    assert (render.returncode, out) == (130, b"")
+    # While the kernel is compiled, Mitsuba's own handler answers first.
+    assert (render.returncode, re.sub(rb"\x1b\[31m.*winding down\.\.\n\x1b\[0m", b"", out)) == (130, b"")
     assert said.endswith(b"\r\x1b[Kmitsuba-subdivision: interrupted\r\n")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cube.obj", "scene.xml"]
