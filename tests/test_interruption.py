@@ -1,6 +1,5 @@
 import fcntl
 import os
-import re
 import shutil
 import signal
 import struct
@@ -77,7 +76,7 @@ def test_interrupts_within_the_work_are_reported(monkeypatch, capsys):
 
 @pytest.mark.parametrize(
     ("variant", "shading", "seconds", "words"),
-    [("scalar_rgb", "vertex", 0.3, ["--passes", "2"]), ("llvm_ad_rgb", "exact", 3, [])],
+    [("scalar_rgb", "vertex", 0.3, ["--passes", "2"]), ("llvm_ad_rgb", "exact", 6, [])],
 )
 def test_ctrl_c_ends_a_render(tmp_path, shading, seconds, words, variant, request):
     if shading == "exact" and hook_problem():
@@ -98,14 +97,14 @@ def test_ctrl_c_ends_a_render(tmp_path, shading, seconds, words, variant, reques
     said = os.read(mine, 1000)
     while b"Rendering" not in said:
         said += os.read(mine, 1000)
-    # When the render has begun, Mitsuba's own handler is replaced within a moment.
+    # When the render has begun, which takes some seconds without a cache of kernels on a busy machine, Mitsuba's own
+    # handler is replaced within a moment.
     time.sleep(seconds)
     render.send_signal(signal.SIGINT)
     out, _ = render.communicate(timeout=60)
     while b"interrupted" not in said:
         said += os.read(mine, 1000)
     os.close(mine)
-    # While the kernel is compiled, Mitsuba's own handler answers first.
-    assert (render.returncode, re.sub(rb"\x1b\[31m.*winding down\.\.\n\x1b\[0m", b"", out)) == (130, b"")
+    assert (render.returncode, out) == (130, b"")
     assert said.endswith(b"\r\x1b[Kmitsuba-subdivision: interrupted\r\n")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cube.obj", "scene.xml"]

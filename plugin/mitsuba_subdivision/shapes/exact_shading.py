@@ -181,8 +181,8 @@ class ExactShading:
         def found(direction: Vector3, active: Mask) -> tuple[Location, Index]:
             # As for the interaction: near outlines, the line soon leaves the surface again.
             side = dot(vector3(dr.detach(si.n)), direction) * self._sign
-            limits = {"wanted_sign": side}
-            return self.kernel.line_hits(hit, self._map.inverse_direction(direction), start, active, **limits)[:2]
+            d = self._map.inverse_direction(direction)
+            return self.kernel.line_hits(hit, d, start, active, wanted_sign=side)[:2]
 
         location, kind = found(direction, active)
         shape = self._shape()
