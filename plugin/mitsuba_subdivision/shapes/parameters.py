@@ -112,11 +112,14 @@ class Parameters:
     face_normals: bool
     evaluator: Evaluator
     sample_offset: float  # Parameters u = v at which extraordinary vertices are sampled
-    # Whether vertices are samples by another evaluator, or beside extraordinary vertices, for comparison
-    is_sampled: bool
     displacement: Any  # Heights: a texture, or the name ``vertex_NAME`` of a mesh attribute; None without displacement
     displacement_scale: float
     shown: NDArray[np.bool_] | None  # (n_f,) bool: elements whose triangles are kept; None for all
+
+    @property
+    def is_sampled(self) -> bool:
+        """Whether vertices are samples by another evaluator, or beside extraordinary vertices, for comparison."""
+        return self.evaluator != "stabilized" or self.sample_offset > 0
 
 
 def read_parameters(props: mi.Properties) -> Parameters:
@@ -143,8 +146,7 @@ def read_parameters(props: mi.Properties) -> Parameters:
             'parameters "face_normals" and "shading" contradict each other; expected flat or exact shading'
         )
     displacement, scale = _displacement(props)
-    is_sampled = evaluator != "stabilized" or offset > 0
-    if is_sampled:
+    if evaluator != "stabilized" or offset:
         other = "evaluator" if evaluator != "stabilized" else "sample_offset"
         if displacement is not None:
             raise ValueError(
@@ -164,7 +166,7 @@ def read_parameters(props: mi.Properties) -> Parameters:
         source = os.path.basename(str(props["filename"]))
     surface = LimitSurface(cage, scheme)
     shown = _shown(props, surface)
-    form = shading, face_normals, evaluator, offset, is_sampled
+    form = shading, face_normals, evaluator, offset
     return Parameters(surface, source, to_world, tessellation, *form, displacement, scale, shown)
 
 
