@@ -3,7 +3,13 @@
 from mitsuba_usd import usd_scene as usd_scene
 
 from . import fit as fit
-from .cage import Attribute as Attribute, CageError as CageError, CageWarning as CageWarning, ControlCage as ControlCage
+from .cage import (
+    Attribute as Attribute,
+    CageError as CageError,
+    CageWarning as CageWarning,
+    ControlCage as ControlCage,
+    joined_cage as joined_cage,
+)
 from .device_arrays import upload as upload
 from .evaluation.element import limit_stencil as limit_stencil
 from .evaluation.scheme_laws import check_scheme as check_scheme

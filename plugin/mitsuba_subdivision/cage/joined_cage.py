@@ -1,21 +1,61 @@
-"""Several meshes of a file as one control cage."""
+"""Several meshes as one control cage."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
 
-from ..cage.contents import Attribute, CageContents
-from ..cage.errors import CageError, CageSource, shortened, warn
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
+from .contents import Attribute, CageContents
+from .control_cage import ControlCage, cage_of
+from .errors import CageError, CageSource, shortened, warn
 
 Value = TypeVar("Value")
 # Parts of a mesh, and an array with a row for each.
 _PARTS = {"vertices": "positions", "faces": "face_sizes", "creases": "creases", "corners": "corners", "holes": "holes"}
+
+
+def joined_cage(cages: Sequence[ControlCage], **rules: str) -> ControlCage:
+    """Join cages to one, such as objects of the same material.
+
+    Mitsuba traces the code of each shape anew for each render and its derivatives. One shape of a joined cage is traced
+    once, and its control points are those of the cages one after the other.
+
+    Parameters
+    ----------
+    cages : sequence of ControlCage
+        In the same space, see `ControlCage.with_positions`.
+    **rules
+        ``boundary``, ``crease_method``, ``triangle_rule``, ``face_varying`` or ``scheme``, to override the cages'.
+
+    Returns
+    -------
+    ControlCage
+        With the vertices and faces of the cages in their order. A material has the faces that it has in all cages.
+
+    Raises
+    ------
+    CageError
+        If there are no cages, or they differ in scheme or rules that no argument overrides.
+
+    Warns
+    -----
+    CageWarning
+        If texture coordinates or an attribute are left out, because not all cages have them, with the same
+        interpolation and width.
+    """
+    if not cages:
+        raise CageError("no cages to join; expected at least one")
+    scheme = {"scheme": rules["scheme"]} if "scheme" in rules else {}
+    given = [
+        replace(contents, rules={rule: rules.get(rule, value) for rule, value in contents.rules.items()}, **scheme)
+        for contents in (cage.contents for cage in cages)
+    ]
+    return cage_of(joined(given, "joined cage"), **rules)
 
 
 def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
@@ -35,6 +75,10 @@ def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
     by_vertex = list(zip(meshes, starts["vertices"].tolist(), strict=True))
     by_face = list(zip(meshes, starts["faces"].tolist(), strict=True))
     texcoords, attributes = _joined_data(meshes, name)
+    materials: dict[str, list[IntArray]] = {}
+    for mesh, first in by_face:
+        for material, faces in mesh.materials.items():
+            materials.setdefault(material, []).append(faces + first)
     return CageContents(
         np.concatenate([mesh.positions for mesh in meshes]),
         np.concatenate([mesh.face_sizes for mesh in meshes]),
@@ -44,6 +88,7 @@ def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
         holes=np.concatenate([mesh.holes + first for mesh, first in by_face]),
         texcoords=texcoords,
         attributes=attributes,
+        materials={material: np.concatenate(faces) for material, faces in materials.items()},
         rules=rules,
         scheme=scheme,
         source=_JoinedSource(f"{name}, {len(meshes)} meshes", meshes=[mesh.source for mesh in meshes], starts=starts),
