@@ -3,16 +3,11 @@
 from mitsuba_usd import usd_scene as usd_scene
 
 from . import fit as fit
-from .cage import (
-    Attribute as Attribute,
-    CageError as CageError,
-    CageWarning as CageWarning,
-    ControlCage as ControlCage,
-    joined_cage as joined_cage,
-)
+from .cage import Attribute as Attribute, CageError as CageError, CageWarning as CageWarning, ControlCage as ControlCage
 from .device_arrays import upload as upload
 from .evaluation.element import limit_stencil as limit_stencil
 from .evaluation.scheme_laws import check_scheme as check_scheme
+from .files.joined_cage import joined_cage as joined_cage
 from .patches.area_samples import AreaSamples as AreaSamples
 from .patches.closest_points import ClosestPoints as ClosestPoints
 from .patches.patch_samples import StencilMatrices as StencilMatrices

@@ -1,4 +1,5 @@
-"""Steps of inverse rendering with many shapes: `mi.Mesh` of the same triangles, vertex shading, exact shading.
+"""Steps of inverse rendering with many shapes: `mi.Mesh` of the same triangles, vertex shading, exact shading, and the
+cages of all of them in one shape with exact shading.
 
 python tests/benchmarks/steps.py [--counts 16 64] [--repeats 5]
 
@@ -11,25 +12,28 @@ import argparse
 import time
 
 # Before Dr.Jit, so that it finds an LLVM library that works; it registers the shape, too.
-import mitsuba_subdivision  # noqa: F401
+import mitsuba_subdivision as msub
 
 # isort: split
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from mitsuba_subdivision.cage import without_warnings
 from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
 from processes import print_row
 
 from scenes import SIX_CAGES, scene_around, spread
 
-KINDS = {"mesh": "vertex_positions", "vertex": "control_points", "exact": "control_points"}
+KINDS = {"mesh": "vertex_positions", "vertex": "control_points", "exact": "control_points", "joined": "control_points"}
 
 
 def scene_of(kind, count):
     """A scene of so many shapes, and its parameters that move."""
-    shapes = spread("exact" if kind == "exact" else "vertex", SIX_CAGES, count)
+    shapes = spread("exact" if kind in ("exact", "joined") else "vertex", SIX_CAGES, count)
     if kind == "mesh":
         shapes = {name: mesh_of(name, shape) for name, shape in shapes.items()}
+    elif kind == "joined":
+        shapes = {"joined": joined(list(shapes.values()))}
     scene = mi.load_dict(scene_around(shapes, 64, 4, {"type": "prb", "max_depth": 3}))
     parameters = mi.traverse(scene)
     parameters.keep([key for key in parameters.keys() if key.endswith(KINDS[kind])])  # noqa: SIM118
@@ -41,6 +45,17 @@ def mesh_of(name, shape):
     source = mi.traverse(mi.load_dict(shape))
     buffers = {key: np.array(source[key]).reshape(-1, 3) for key in ("faces", "vertex_positions", "vertex_normals")}
     return mitsuba_mesh(name, buffers.pop("faces"), buffers)
+
+
+def joined(shapes):
+    """One shape of the cages of all shapes, in world space."""
+    cages = []
+    for shape in shapes:
+        cage, matrix = msub.ControlCage.from_file(shape["filename"]), np.array(shape["to_world"].matrix, dtype=float)
+        cages.append(cage.with_positions(cage.positions @ matrix[:3, :3].T + matrix[:3, 3]))
+    kept = {key: value for key, value in shapes[0].items() if key not in ("filename", "to_world")}
+    with without_warnings():  # Not all of them have texture coordinates
+        return {**kept, **msub.joined_cage(cages).as_properties(mi)}
 
 
 def milliseconds(kind, count, repeats, *, is_frozen):

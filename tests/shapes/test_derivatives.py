@@ -2,11 +2,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import CageWarning, LimitSurface, upload
+from mitsuba_subdivision import CageWarning, LimitSurface, joined_cage, upload
 from patches.closed_cages import cube_with_hexagon, extraordinary_triangles
 from reference.refined_cages import refine_first
 from shapes.cages import MIRRORED, RING, SHEARED, bitmap, cube, described, load, with_attributes
-from shapes.scenes import down, rays, scene_with
+from shapes.scenes import down, perspective, rays, scene_with
 from shapes.updates import MODES, derivative, moving
 from shapes.variants import every_ad_variant, exact, exact_llvm, llvm
 
@@ -171,3 +171,27 @@ def test_derivatives_enabled_after_the_last_update_warn_once():
     with pytest.warns(CageWarning, match=r"expected params\.update\(\)"):
         scene.ray_intersect(down())
     scene.ray_intersect(down())
+
+
+@exact_llvm
+def test_a_joined_cage_has_the_picture_and_the_gradients_of_its_cages():
+    cages = [
+        cage.with_positions(cage.positions + offset) for cage, offset in ((cube(), -1.2), (cube(creases=RING), 1.2))
+    ]
+    pictures, gradients = [], []
+    for parts in (cages, [joined_cage(cages)]):
+        shapes = {f"shape_{number}": described(part, shading="exact") for number, part in enumerate(parts)}
+        sensor = perspective(32, (6, -9, 7), fov=30)
+        scene = scene_with(**shapes, sensor=sensor, light={"type": "constant"}, integrator={"type": "prb"})
+        parameters = mi.traverse(scene)
+        keys = [f"{name}.control_points" for name in shapes]
+        for key in keys:
+            dr.enable_grad(parameters[key])
+        parameters.update()
+        picture = mi.render(scene, parameters, spp=4, seed=1)
+        dr.backward(dr.mean(dr.square(picture), axis=None))
+        pictures.append(picture.numpy())
+        gradients.append(np.concatenate([np.array(dr.grad(parameters[key])) for key in keys]))
+    assert pictures[0].std() > 0.1
+    np.testing.assert_allclose(*pictures, rtol=0, atol=ORDER)
+    np.testing.assert_allclose(*gradients, rtol=0, atol=ORDER * np.abs(gradients[0]).max())

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from ..cage import validation
 from ..cage.contents import RULES, Attribute, CageContents, validated_attribute
 from ..cage.errors import CageError, CageSource, number_of_such, shortened, warn
-from ..cage.joined_cage import joined
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray, Topology
 from . import usd_stage
+from .joined_cage import joined
 from .usd_skinning import Skinning
 from .usd_stage import FLAT_SCHEMES, INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, time_of, value_at
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
 
+from ..cage import ControlCage, cage_of
+from ..cage.contents import Attribute, CageContents
+from ..cage.errors import CageError, CageSource, shortened, warn
 from ..mesh import ragged
 from ..mesh.connectivity import IntArray
-from .contents import Attribute, CageContents
-from .control_cage import ControlCage, cage_of
-from .errors import CageError, CageSource, shortened, warn
 
 Value = TypeVar("Value")
 # Parts of a mesh, and an array with a row for each.
@@ -50,15 +50,14 @@ def joined_cage(cages: Sequence[ControlCage], **rules: str) -> ControlCage:
     """
     if not cages:
         raise CageError("no cages to join; expected at least one")
-    scheme = {"scheme": rules["scheme"]} if "scheme" in rules else {}
-    given = [
-        replace(contents, rules={rule: rules.get(rule, value) for rule, value in contents.rules.items()}, **scheme)
-        for contents in (cage.contents for cage in cages)
-    ]
-    return cage_of(joined(given, "joined cage"), **rules)
+    return cage_of(joined([cage.contents for cage in cages], "joined cage", rules), **rules)
 
 
-def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
+def joined(
+    meshes: Sequence[CageContents],
+    name: str,
+    given: Mapping[str, str] | None = None,  # Rules and scheme that replace those of the meshes
+) -> CageContents:
     """Join meshes with valid indices to one cage; messages begin with the name of their file.
 
     Texture coordinates and attributes that not all meshes have, with the same interpolation and width, are dropped with
@@ -66,8 +65,9 @@ def joined(meshes: Sequence[CageContents], name: str) -> CageContents:
     """
     if len(meshes) == 1:
         return meshes[0]
-    rules = {rule: _common(rule, meshes, [mesh.rules[rule] for mesh in meshes]) for rule in meshes[0].rules}
-    scheme = _common("scheme", meshes, [mesh.scheme for mesh in meshes])
+    given, rules = given or {}, meshes[0].rules
+    rules = {rule: given.get(rule) or _common(rule, meshes, [mesh.rules[rule] for mesh in meshes]) for rule in rules}
+    scheme = given.get("scheme") or _common("scheme", meshes, [mesh.scheme for mesh in meshes])
     starts = {
         part: ragged.starts(np.array([len(getattr(mesh, rows)) for mesh in meshes])) for part, rows in _PARTS.items()
     }
