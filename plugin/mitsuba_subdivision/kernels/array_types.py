@@ -9,8 +9,8 @@ from __future__ import annotations
 import gc
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from functools import wraps
+from collections.abc import Callable
+from functools import cache, wraps
 from typing import Any
 from weakref import WeakKeyDictionary, ref
 
@@ -51,6 +51,7 @@ _of_thread = threading.local()
 # Prefixes of modules whose objects contain Dr.Jit arrays.
 _PACKAGE = __name__.partition(".")[0]
 _PACKAGES = (f"{_PACKAGE}.kernels.", f"{_PACKAGE}.shapes.")
+_ARRAY = object()
 # Held while a method is `replayed`.
 _replaying = threading.Lock()
 
@@ -76,7 +77,7 @@ def replayed(method: Callable[..., Any]) -> Callable[..., Any]:
                 # Without a reference cycle: objects that the collector frees may end the process later.
                 this = ref(self)
                 recording = dr.freeze(lambda _, *arguments: method(this(), *arguments))
-                recordings[method] = recording, list(arrays_in(vars(self), set()))
+                recordings[method] = recording, arrays_in(vars(self), set())
             recording, arrays = recordings[method]
             return recording(arrays, *arguments)
         finally:
@@ -87,22 +88,38 @@ def replayed(method: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def arrays_in(value: Any, seen: set[int]) -> Iterator[Any]:
-    """Iterate over the Dr.Jit arrays in a value, in containers, and in objects of kernels and shapes, each once."""
-    if id(value) in seen:
-        return
-    seen.add(id(value))
-    kind = type(value)
+def arrays_in(value: Any, seen: set[int]) -> list[Any]:
+    """The Dr.Jit arrays in a value, in containers, and in objects of kernels and shapes, each once.
+
+    Frozen functions ask each shape eight times for each call.
+    """
+    found, rest = [], [value]
+    while rest:
+        value = rest.pop()
+        kind: Any = type(value)
+        contents = _contents(kind)
+        if contents is not None and id(value) not in seen:
+            seen.add(id(value))
+            if contents is _ARRAY:
+                found.append(value)
+            else:
+                rest.extend(contents(value))
+    return found
+
+
+@cache
+def _contents(kind: type) -> Any:
+    """Function for the contents of objects of a class; `_ARRAY` for Dr.Jit arrays, and None for all other classes."""
     if dr.is_array_v(kind):
-        if dr.is_jit_v(kind):
-            yield value
-    elif isinstance(value, (dict, list, tuple)):
-        for item in value.values() if isinstance(value, dict) else value:
-            yield from arrays_in(item, seen)
-    elif isinstance(value, SharedArray) or (kind.__module__.startswith(_PACKAGES) and hasattr(value, "__dict__")):
-        for name in getattr(kind, "UPLOADED_LATER", ()):
-            getattr(value, name)
-        yield from arrays_in(vars(value), seen)
+        return _ARRAY if dr.is_jit_v(kind) else None
+    if issubclass(kind, dict):
+        return dict.values
+    if issubclass(kind, (list, tuple)):
+        return iter
+    if issubclass(kind, SharedArray) or (kind.__module__.startswith(_PACKAGES) and kind.__dictoffset__):
+        later = getattr(kind, "UPLOADED_LATER", ())
+        return lambda value: [*(getattr(value, name) for name in later), *vars(value).values()]
+    return None
 
 
 class LaterArrays:

@@ -168,4 +168,4 @@ class DeviceState:
 
     def _arrays(self) -> SimpleNamespace:
         self.is_frozen, shape = True, self._shape()
-        return SimpleNamespace(arrays=[] if shape is None else list(arrays_in(vars(shape), {id(self)})))
+        return SimpleNamespace(arrays=[] if shape is None else arrays_in(vars(shape), {id(self)}))
