@@ -48,8 +48,8 @@ def surroundings(topology: Topology) -> tuple[IndexArray, IndexArray]:
     if t.common_size:
         count = t.common_size - 2
         start[half_edge[::-1]] = np.arange(0, count * len(half_edge), count, dtype=np.int32)[::-1]
-        around = t.around_faces(t.next.take(half_edge), count)
-        return start, t.face_vertices.take(np.stack(around, axis=1).ravel())
+        ahead = t.face_vertices.take(np.stack(t.around_faces(t.next, count), axis=1))
+        return start, ahead.take(half_edge, axis=0).ravel()
     counts = t.face_sizes[t.face[half_edge]] - 2
     start[half_edge[::-1]] = ragged.starts(counts)[::-1]
     return start, t.face_vertices.take(t.along_faces(t.next.take(half_edge), counts))
