@@ -20,8 +20,8 @@ def patch_table(scheme, cage):
     return LimitSurface(cage, scheme).patches
 
 
-def signatures_of(table, corners):
-    return signatures_at(table.topology, table.half_edge_of_corner[corners], table.scheme.element)
+def signatures_of(table, corners, **options):
+    return signatures_at(table.topology, table.half_edge_of_corner[corners], table.scheme.element, **options)
 
 
 def turns(signature, corner_count):
@@ -64,7 +64,7 @@ def test_patches_of_a_class_see_the_same_near_faces_of_large_fans(scheme):
         centre += 2 * count + 2
     table = PatchTable(mesh_of(centre, faces), scheme_named(scheme))
     for patch_class in table.classes:
-        assert {each.near() for each in signatures_of(table, patch_class.corners)} == {patch_class.signature}
+        assert {*signatures_of(table, patch_class.corners, near=True)} == {patch_class.signature}
         start, end = table.topology.border_neighbours(table.topology.face_vertices[patch_class.corners])
         for controls, ends in zip(table.controls_of(patch_class), zip(start, end, strict=True), strict=True):
             assert {*ends} <= {*controls}

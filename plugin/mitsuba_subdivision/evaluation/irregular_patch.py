@@ -119,7 +119,7 @@ class IrregularPatch:
                     frame = rows[1:3].copy() if uneven is None else uneven
                     frame[:, at_point] = self.limit_frame[:, None]
         rows[:, at_point], scale[:, at_point] = np.nan, 1
-        if evaluator in ("stabilized", "limit"):
+        if evaluator in ("stabilized", "limit") and at_point.any():
             rows[0, at_point], rows[1:3, at_point] = np.eye(1, rows.shape[2])[0], self.edge_tangents[:, None]
         level = np.where(at_point, equations.AT_EXTRAORDINARY_POINT, level)
         return equations.SampleRows(

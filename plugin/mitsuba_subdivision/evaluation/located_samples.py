@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from ..mesh import ragged
 from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
@@ -76,6 +77,7 @@ class LocatedSamples:
         for number, in_element in _grouped(element):
             samples[number] = in_element
         for depth in range(MOST_DEPTH + 1):
+            divide(trees)
             nodes: list[Node] = [(tree, len(in_tree), []) for tree, in_tree in zip(trees, samples, strict=True)]
             self._depths.append(nodes)
             inner = []
@@ -89,15 +91,15 @@ class LocatedSamples:
             counts = [len(samples[number]) for number in inner]
             if not sum(counts):
                 break
-            divide(trees[number] for number in inner)
             in_inner, begins = np.concatenate([samples[number] for number in inner]), np.cumsum(counts) - counts
-            child, *child_uv, _ = domain.child_at(*uv[in_inner].T)
+            child, *child_uv, faster = domain.child_at(*uv[in_inner].T)
             is_only = np.repeat([trees[number].kind == PartKind.ONLY_CHILD for number in inner], counts)
             # Children at corners are numbered from the element's first corner; the middle of a triangle comes last.
             corners = domain.corner_count
             child = np.where(child < corners, (child + corner[in_inner]) % corners, child)
             child, uv[in_inner] = np.where(is_only, 0, child), np.where(is_only, uv[in_inner].T, child_uv).T
             self.path[in_inner] += child << 2 * depth
+            speed[in_inner] *= np.where(is_only, 1, faster)
             in_children: dict[PatchTree, tuple[int, list[IntArray]]] = {}
             for key, at in _grouped(4 * np.repeat(np.arange(len(inner)), counts) + child):
                 (parent, _, children), number, in_child = nodes[inner[key // 4]], key % 4, in_inner[at]
@@ -105,7 +107,6 @@ class LocatedSamples:
                 index, in_parents = in_children.setdefault(tree, (len(in_children), []))
                 in_parents.append(in_child)
                 children.append((number, index, at - begins[key // 4]))
-                speed[in_child] *= parent.domains[number].matrix[0, 0]
             trees, samples = [*in_children], [np.concatenate(in_parents) for _, in_parents in in_children.values()]
         else:
             raise not_isolated(scheme, trees[0].signature)
@@ -171,8 +172,11 @@ class LocatedSamples:
                     child_rows = below[child][begins[child] - len(at) : begins[child]]
                     product = times_matrix(
                         child_rows.reshape(1, -1, child_rows.shape[2]), tree.children[child_number][1]
-                    )
-                    node_weights[at] = product.reshape(len(at), size, -1)
+                    ).reshape(len(at), size, -1)
+                    if len(at) == count:
+                        node_weights = product
+                    else:
+                        node_weights[at] = product
                 current.append(node_weights)
             below = current
         return below
@@ -191,7 +195,7 @@ def _grouped(keys: IntArray) -> Iterator[tuple[int, IntArray]]:
     """Return the distinct keys in increasing order, each with the indices at which it stands."""
     counts = np.bincount(keys)
     occurring, order = np.flatnonzero(counts), np.argsort(keys.astype(np.min_scalar_type(len(counts))), kind="stable")
-    return zip(occurring.tolist(), np.split(order, np.cumsum(counts[occurring])[:-1]), strict=False)
+    return zip(occurring.tolist(), ragged.rows(order, counts[occurring]), strict=True)
 
 
 def frame_magnitude(leaves: Leaves, sample_rows: SampleRows) -> FloatArray:

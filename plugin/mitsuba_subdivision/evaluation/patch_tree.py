@@ -27,6 +27,7 @@ from ..mesh.one_ring import RingTable, joined_rings, one_ring, one_rings
 from ..mesh.signature import Fan, Signature, signatures_at
 from ..schemes.domain import IDENTITY, FloatArray, ParameterMap
 from ..schemes.scheme import Scheme, SchemeError
+from .equations import times_matrix
 from .irregular_patch import IrregularPatch
 
 # Number of control points of the one-rings that are refined together, which bounds memory to tens of megabytes.
@@ -53,20 +54,30 @@ class PatchTree:
     def __init__(self, scheme: Scheme, signature: Signature) -> None:
         self.scheme, self.signature = scheme, signature
         self.control_count = one_ring(signature).vertex_count  # K, of the element's one-ring
-        self._children: list[tuple[PatchTree, FloatArray]] = []
+        # Of elements that are refined: children, maps from the element's parameters to theirs, and their stencils
+        self.refined: list[tuple[PatchTree, FloatArray]] = []
+        self.domains: tuple[ParameterMap, ...] = ()
+
+    @cached_property
+    def tip_corners(self) -> list[int]:
+        """The corners at which the element may be self-similar: all others are regular. None for regular elements."""
+        scheme, signature = self.scheme, self.signature
+        # Each refinement reduces the sharpness, so semi-sharp elements are not self-similar.
+        if signature.is_semi_sharp or lattice_stencils(scheme, signature) is not None:
+            return []
+        count = len(signature.fans) if signature.kind == "face" else signature.fans[0].face_count
+        # The parameters of an element that does not fit the domain begin at its first corner only.
+        corners = range(count if count == scheme.domain.corner_count else 1)
+        others = ((corner, signature.rotated(corner).fans[1:]) for corner in corners)
+        return [corner for corner, fans in others if all(_is_regular_fan(scheme, fan) for fan in fans)]
 
     @cached_property
     def piece(self) -> Piece | None:
         """The whole element as one piece: a regular patch, or self-similar at one of its corners. None for others."""
         scheme, signature = self.scheme, self.signature
-        if signature.is_semi_sharp:
-            return None  # Not self-similar: each refinement reduces the sharpness
-        lattice = lattice_stencils(scheme, signature)
-        if lattice is not None:
+        if not signature.is_semi_sharp and (lattice := lattice_stencils(scheme, signature)) is not None:
             return Piece(IDENTITY, lattice, None)
-        corner_count = len(signature.fans) if signature.kind == "face" else signature.fans[0].face_count
-        # The parameters of an element that does not fit the domain begin at its first corner only.
-        for corner in range(corner_count if corner_count == scheme.domain.corner_count else 1):
+        for corner in self.tip_corners:
             patch = irregular_patch(scheme, signature.rotated(corner))
             if patch is not None:
                 order = rotation_order(signature, corner)
@@ -90,14 +101,11 @@ class PatchTree:
     @property
     def children(self) -> list[tuple[PatchTree, FloatArray]]:
         """All children with their stencils over the element's control points, ``(K_child, K)``; empty for a piece."""
-        if self.piece is None and not self._children:
-            divide([self])
-        return self._children
-
-    @property
-    def domains(self) -> tuple[ParameterMap, ...]:
-        """Maps from the element's parameters to those of each child: `ParameterDomain.children`, or the identity."""
-        return (IDENTITY,) if len(self.children) == 1 else self.scheme.domain.children
+        if self.piece is not None:
+            return []
+        if not self.refined:
+            refine([self])
+        return self.refined
 
     @cached_property
     def regular_count(self) -> int:
@@ -110,7 +118,7 @@ class PatchTree:
             return (self.piece,) if self.piece.patch is not None else ()
         return tuple(
             tip.inside(domain, stencils)
-            for domain, (child, stencils) in zip(self.domains, self.children, strict=True)
+            for (child, stencils), domain in zip(self.children, self.domains, strict=True)
             for tip in child.tips
         )
 
@@ -120,7 +128,7 @@ class PatchTree:
         if self.piece is not None:
             return np.eye(2)[None][: self.regular_count], np.zeros((self.regular_count, 2))
         matrices, offsets = [], []
-        for domain, (child, _) in zip(self.domains, self.children, strict=True):
+        for (child, _), domain in zip(self.children, self.domains, strict=True):
             to_element, (inner_matrices, inner_offsets) = domain.inverse(), child.regular_domains
             matrices.append(to_element.matrix @ inner_matrices)
             offsets.append(inner_offsets @ to_element.matrix.T + to_element.offset)
@@ -132,21 +140,17 @@ class PatchTree:
 
         For a piece the last entry is its index among those of its kind, in the order of `coefficients` or `tips`.
         """
-        below = self._below + np.array([0, 0, 1]) * (self._below[:, :1] <= PartKind.ONLY_CHILD)
-        return np.concatenate([[[self.kind, self.turn, int(self.piece is None)]], below])
-
-    @cached_property
-    def _below(self) -> IntArray:
-        children = [child for child, _ in self.children]
+        children, root = [child for child, _ in self.children], [self.kind, self.turn, int(self.piece is None)]
         if not children:
-            return np.empty((0, 3), dtype=np.int64)
-        # For each child and `PartKind` the first index: of a node for inner nodes, of a piece for regular pieces, tips.
-        sizes = np.array([[len(child._below)] * 2 + [child.regular_count, len(child.tips)] for child in children])
-        first = np.cumsum(sizes, axis=0) - sizes + [len(children), len(children), 0, 0]
-        rows = [(child.kind, child.turn, row[child.kind]) for child, row in zip(children, first.tolist(), strict=True)]
-        below = np.concatenate([child._below for child in children])
-        below[:, 2] += first[np.repeat(np.arange(len(children)), sizes[:, 0]), below[:, 0]]
-        return np.concatenate([rows, below])
+            return np.array([root])
+        # For each child and `PartKind` the number before: of nodes for inner nodes, of pieces for regular pieces, tips.
+        sizes = np.array([[len(child.nodes) - 1] * 2 + [child.regular_count, len(child.tips)] for child in children])
+        before = np.cumsum(sizes, axis=0) - sizes + [len(children), len(children), 0, 0]
+        of_children = [child.nodes for child in children]
+        nodes = np.concatenate([[root], *[rows[:1] for rows in of_children], *[rows[1:] for rows in of_children]])
+        child = np.concatenate([np.arange(len(children)), np.repeat(np.arange(len(children)), sizes[:, 0])])
+        nodes[1:, 2] += before[child, nodes[1:, 0]]
+        return nodes
 
     def coefficients(
         self,
@@ -158,12 +162,16 @@ class PatchTree:
         """Compute coefficients of the regular pieces over the element's one-ring. Returns (r, m, K)."""
         if self.piece is not None and self.piece.patch is None:
             return (form @ self.piece.stencils)[None]
-        known, coefficients = {} if known is None else known, [np.empty((0, len(form), self.control_count))]
+        known, begin = {} if known is None else known, 0
+        coefficients = np.empty((self.regular_count, len(form), self.control_count))
         for child, stencils in self.children:
             if child not in known:
                 known[child] = child.coefficients(form, known)
-            coefficients.append(known[child] @ stencils)
-        return np.concatenate(coefficients)
+            end = begin + child.regular_count
+            flat = (part.reshape(1, -1, part.shape[2]) for part in (known[child], coefficients[begin:end]))
+            times_matrix(next(flat), stencils, out=next(flat))
+            begin = end
+        return coefficients
 
 
 # The limit is several times the number of elements of a cage with some hundred classes of semi-sharp one-rings.
@@ -174,14 +182,24 @@ def patch_tree(scheme: Scheme, signature: Signature) -> PatchTree:
 
 
 def divide(elements: Iterable[PatchTree]) -> None:
-    """Make the children of elements that have none yet: refined together, they take little longer than one.
+    """Find the pieces among elements, and make the children of all others. Raises SchemeError as `refine`."""
+    elements = [*dict.fromkeys(elements)]
+    new = (element for element in elements if "piece" not in vars(element))
+    refine(patch_tree(one.scheme, one.signature.rotated(corner)) for one in new for corner in one.tip_corners)
+    refine(element for element in elements if element.piece is None)
+
+
+def refine(elements: Iterable[PatchTree]) -> None:
+    """Refine the elements that are not yet refined: together they take little longer than one.
 
     Raises SchemeError if the scheme divides domains differently from `ParameterDomain.children`.
     """
-    undivided = [element for element in dict.fromkeys(elements) if element.piece is None and not element._children]
-    for run in ragged.runs_of([element.control_count for element in undivided], JOINED_CONTROLS):
-        scheme, in_run = undivided[0].scheme, undivided[run]
+    unrefined = [element for element in dict.fromkeys(elements) if not element.refined]
+    for run in ragged.runs_of([element.control_count for element in unrefined], JOINED_CONTROLS):
+        scheme, in_run = unrefined[0].scheme, unrefined[run]
         of_run = refined_children(scheme, [element.signature for element in in_run])
+        different = dict.fromkeys(child.signature for children in of_run for child in children)
+        trees = {signature: patch_tree(scheme, signature) for signature in different}
         for element, children in zip(in_run, of_run, strict=True):
             copies = (IDENTITY,) if len(children) == 1 else scheme.domain.children
             is_same = [child.domain.is_same(copy) for child, copy in zip(children, copies, strict=False)]
@@ -190,7 +208,8 @@ def divide(elements: Iterable[PatchTree]) -> None:
                     f"{scheme.name}: a child's domain is none of {len(copies)} copies, in their order; expected "
                     "the four of `ParameterDomain.children`, or the whole domain"
                 )
-            element._children = [(patch_tree(scheme, child.signature), child.stencils) for child in children]
+            element.refined = [(trees[child.signature], child.stencils) for child in children]
+            element.domains = copies
 
 
 def patch_trees(scheme: Scheme, signatures: Iterable[Signature]) -> list[PatchTree]:
@@ -243,11 +262,14 @@ def refined_children(scheme: Scheme, signatures: Sequence[Signature]) -> list[li
     ]
     half_edges = np.array([half_edge for *_, half_edge in parts])
     of_parts = signatures_at(refined, half_edges, scheme.element)
-    # A group for each child, of one element
-    rings, groups = RingTable(refined, one_rings(of_parts), half_edges, np.ones(len(parts), int)), np.arange(len(parts))
+    groups = {signature: group for group, signature in enumerate(dict.fromkeys(of_parts))}
+    group = np.array([groups[signature] for signature in of_parts])
+    order, group_counts = np.argsort(group, kind="stable"), np.bincount(group)
+    rings = RingTable(refined, one_rings(groups), half_edges[order], group_counts)
     # A row for each control point of each child, as long as the one-ring of the parent has vertices.
-    row_counts, controls = rings.vertex_counts, np.concatenate(rings.vertices_of(groups, 0 * groups), axis=None)
-    parent_of_row = np.repeat([parent for parent, *_ in parts], row_counts)
+    controls = np.concatenate(rings.vertices_of(group[order], ragged.index_in_row(group_counts)), axis=None)
+    row_counts = rings.vertex_counts[group[order]]
+    parent_of_row = np.repeat(np.array([parent for parent, *_ in parts])[order], row_counts)
     offsets = ragged.offsets(np.diff(first_vertices)[parent_of_row])
     rows, columns, weights = table.entries(controls)
     error = np.abs(np.bincount(rows, weights, minlength=len(parent_of_row)) - 1)
@@ -260,10 +282,10 @@ def refined_children(scheme: Scheme, signatures: Sequence[Signature]) -> list[li
         )
     places = offsets[rows] + columns - first_vertices[parent_of_row[rows]]
     flat: FloatArray = np.bincount(places, weights, minlength=offsets[-1]).astype(np.float64, copy=False)
-    blocks = np.split(flat, offsets[np.cumsum(row_counts)[:-1]])
+    blocks = ragged.rows(flat, np.diff(offsets[ragged.offsets(row_counts)]))
     children: list[list[Child]] = [[] for _ in signatures]
-    for (parent, domain, _), signature, count, block in zip(parts, of_parts, row_counts.tolist(), blocks, strict=True):
-        children[parent].append(Child(domain, signature, block.reshape(count, -1)))
+    for (parent, domain, _), signature, place in zip(parts, of_parts, np.argsort(order).tolist(), strict=True):
+        children[parent].append(Child(domain, signature, blocks[place].reshape(row_counts[place], -1)))
     return children
 
 
@@ -341,19 +363,17 @@ def rotation_order(signature: Signature, corner: int) -> IntArray:
 def irregular_patch(scheme: Scheme, signature: Signature) -> IrregularPatch | None:
     """Return the patch of a self-similar one-ring: child 0 has its signature, all others are regular; else None."""
     count = len(scheme.domain.children)
-    # The other corners of the element are corners of the regular children, too.
-    if not all(_is_regular_fan(scheme, fan) for fan in signature.fans[1:]):
-        return None
-    ((first, *others),) = refined_children(scheme, [signature])
+    refine([element := patch_tree(scheme, signature)])
+    (first, matrix), *others = element.refined
     if len(others) != count - 1 or first.signature != signature:
         return None
-    matrix, regular_stencils = first.stencils, []
-    for child in others:
+    regular_stencils = []
+    for child, stencils in others:
         lattice = lattice_stencils(scheme, child.signature)
         if lattice is None:
             return None
-        regular_stencils.append(lattice @ child.stencils)
-    children = np.stack(regular_stencils)
+        regular_stencils.append(lattice @ stencils)
+    matrix, children = matrix.copy(), np.stack(regular_stencils)
     slots = np.arange(len(matrix))
     if signature.fans[0].rule == VertexRule.DART:
         # The other end of the sharp edge is two vertices of the one-ring, one on each side of the edge. As separate
@@ -366,6 +386,7 @@ def irregular_patch(scheme: Scheme, signature: Signature) -> IrregularPatch | No
     return IrregularPatch(scheme, signature, slots, matrix, children)
 
 
+@lru_cache(maxsize=1024)
 def lattice_stencils(scheme: Scheme, signature: Signature) -> FloatArray | None:
     """Return stencils ``(R, K)`` of the control points of a regular patch, in the order of the scheme's lattice.
 

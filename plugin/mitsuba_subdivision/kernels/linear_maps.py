@@ -140,8 +140,8 @@ class SparseMatrix:
 class WeightBlocks:
     """Blocks of weights on the device, each a matrix that makes vectors of the control points of a patch.
 
-    There is a lane for each patch of each block. Weights of the first control point are those of the transposed map, as
-    the others are relative to it: they sum to one for the first vector, and to zero for the others.
+    There is a lane for each patch of each block. Weights sum to one for the first vector, and to zero for the others,
+    so vectors are relative to the first control point, whose weights only the transposed map reads.
     """
 
     def __init__(
@@ -166,12 +166,9 @@ class WeightBlocks:
         rows = np.zeros((sum(len(part) * part.shape[2] for part in weights), self._row_size), types.numpy_float)
         end = 0
         for _, parts in groupby(weights, lambda part: part.shape[2]):
-            part = np.concatenate([*parts])
+            part = np.concatenate([*parts], dtype=rows.dtype, casting="same_kind")
             begin, end = end, end + len(part) * part.shape[2]
-            block_rows = rows[begin:end].reshape(len(part), part.shape[2], -1)[:, :, : self.width]
-            block_rows[:] = part.swapaxes(1, 2)
-            block_rows[:, 0] = -part[:, :, 1:].sum(axis=2)
-            block_rows[:, 0, 0] += 1
+            rows[begin:end].reshape(len(part), part.shape[2], -1)[:, :, : self.width] = part.swapaxes(1, 2)
         self._lane = types.indices(block), types.indices(patch)
         self._columns, self._weights = types.indices(columns), types.floats(rows)
 
@@ -333,12 +330,12 @@ def _piece_blocks(
         table.append((len(block_weights), first, count, control_count, row, *pieces))
     if not table:
         return None
-    block_counts, *data = np.array(table).T
-    index = ragged.index_in_row(block_counts)
+    block_counts, *data = np.array(table, dtype=np.uint32).T
+    index = ragged.index_in_row(block_counts).astype(np.uint32)
     first, count, control_count, row, piece, block_step, patch_step = np.repeat(data, block_counts, axis=1)
     # Successive controls of a patch are as far apart as the class has patches.
     columns = np.stack([first, count, control_count, row + index * control_count], axis=1)
-    block, patch = np.repeat(np.arange(len(count)), count), ragged.index_in_row(count)
+    block, patch = np.repeat(np.arange(len(count)), count), ragged.index_in_row(count).astype(np.uint32)
     places = (piece + index * block_step)[block] + patch * patch_step[block]
     return WeightBlocks(types, [part for part, _ in weights.values()], columns, controls, block, patch, places)
 

@@ -43,20 +43,16 @@ def surroundings(topology: Topology) -> tuple[IndexArray, IndexArray]:
             fans.append(t.turn.take(fans[-1]))
         ordered.append(np.stack(fans if kind % 2 else 2 * fans, axis=1).ravel())
     half_edge = np.concatenate(ordered)
-    counts = np.broadcast_to((t.common_size or t.face_sizes[t.face[half_edge]]) - 2, len(half_edge))
-    begins = ragged.starts(counts)
     start: IndexArray = np.zeros(t.half_edge_count, dtype=np.int32)
     # Backwards, as the last assignment is kept.
-    start[half_edge[::-1]] = begins[::-1]
-    vertices: IndexArray = np.empty(int(counts.sum()), dtype=np.int32)
-    for step in range(int(counts.max(initial=0))):
-        if not t.common_size:
-            is_long = counts > step
-            half_edge, counts, begins = half_edge[is_long], counts[is_long], begins[is_long]
-        half_edge = t.next.take(half_edge)
-        places = slice(step, None, t.common_size - 2) if t.common_size else begins + step
-        vertices[places] = t.face_vertices.take(half_edge)
-    return start, vertices
+    if t.common_size:
+        count = t.common_size - 2
+        start[half_edge[::-1]] = np.arange(0, count * len(half_edge), count, dtype=np.int32)[::-1]
+        ahead = t.face_vertices.take(np.stack(t.around_faces(t.next, count), axis=1))
+        return start, ahead.take(half_edge, axis=0).ravel()
+    counts = t.face_sizes[t.face[half_edge]] - 2
+    start[half_edge[::-1]] = ragged.starts(counts)[::-1]
+    return start, t.face_vertices.take(t.along_faces(t.next.take(half_edge), counts))
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,8 +157,9 @@ def one_ring(signature: Signature) -> OneRing:
 def one_rings(signatures: Iterable[Signature]) -> list[OneRing]:
     """Return the unfolded one-rings of signatures; semi-sharp features change nothing."""
     smooth = [signature.smoothed for signature in signatures]
-    rings = {signature: _RINGS[signature] for signature in smooth if signature in _RINGS}
-    if missing := [signature for signature in dict.fromkeys(smooth) if signature not in rings]:
+    different = dict.fromkeys(smooth)
+    rings = {signature: ring for signature in different if (ring := _RINGS.get(signature)) is not None}
+    if missing := [signature for signature in different if signature not in rings]:
         if len(_RINGS) + len(missing) > MOST_RINGS:
             _RINGS.clear()
         rings |= zip(missing, _glued_rings(missing), strict=True)
@@ -222,9 +219,11 @@ def _glued_rings(signatures: Sequence[Signature]) -> list[OneRing]:
     glued = Topology(0, apart.face_sizes[lowest[apart.face_offsets[:-1]] == apart.face_offsets[:-1]], 0 * kept, names)
 
     # Vertices are numbered by their first half-edges.
-    _, first, fan = np.unique(fan_labels(glued)[0], return_index=True, return_inverse=True)
-    vertex = np.argsort(np.argsort(first))[fan]
-    rules = np.zeros(len(first), dtype=np.int8)
+    labels = fan_labels(glued)[0]
+    first = ragged.first_indices(labels, len(labels))[labels]
+    is_first = first == np.arange(len(first))
+    vertex = (np.cumsum(is_first) - 1)[first]
+    rules = np.zeros(np.count_nonzero(is_first), dtype=np.int8)
     rules[vertex[walks[stays]]] = [fan.rule for fan in fans]
 
     # Vertices around the corners, as in `surroundings`.
@@ -242,7 +241,7 @@ def _glued_rings(signatures: Sequence[Signature]) -> list[OneRing]:
     faces, vertices = np.append(glued.face, glued.face_count)[half_edges], np.append(vertex, len(rules))[half_edges]
     local_vertex = (vertex - np.repeat(vertices[:-1], np.diff(half_edges))).astype(np.int32)
     names -= np.repeat(half_edges[:-1], np.diff(half_edges))
-    around = np.split(walks - np.repeat(half_edges[:-1], corner_counts)[fan_of_walk], last[:-1] + 1)
+    around = ragged.rows(walks - np.repeat(half_edges[:-1], corner_counts)[fan_of_walk], counts)
     ends = local_vertex[np.stack([glued.next[walks[last - counts + 1]], glued.prev[walks[last]]], axis=1)].tolist()
     spans = (pairwise(offsets.tolist()) for offsets in (faces, half_edges, vertices))
     rings = []

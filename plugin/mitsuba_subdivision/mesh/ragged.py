@@ -7,6 +7,7 @@ An example are the faces of a polygon mesh, whose entries are the vertices at th
 ``starts(lengths)``           ``0 3 3``      where each row begins
 ``offsets(lengths)``          ``0 3 3 5``    the same, then where the last row ends
 ``index_in_row(lengths)``     ``0 1 2 0 1``  the index of each entry in its row
+``rows(values, lengths)``                    a list of the rows
 ``ranges(first, lengths)``                   ``first, first + 1, ...`` in every row
 ============================  =============  ======================================
 
@@ -17,12 +18,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import pairwise
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 # Integers of any width; docstrings state the width where it matters.
 IntArray = NDArray[np.integer]
+Rows = TypeVar("Rows", NDArray[Any], list[int])
 
 # Number of entries of a chunk of `chunks_of`.
 CHUNK_LENGTH = 1 << 14
@@ -45,6 +48,11 @@ def index_in_row(lengths: IntArray) -> NDArray[np.int64]:
     """Return ``(lengths.sum(),)`` the 0-based index of each entry in its row."""
     index = np.repeat(starts(lengths), lengths)
     return np.subtract(np.arange(len(index)), index, out=index)
+
+
+def rows(values: Rows, lengths: ArrayLike) -> list[Rows]:
+    """Return the rows, of an array as views. `numpy.split` takes ten times as long."""
+    return [values[begin:end] for begin, end in pairwise(offsets(lengths).tolist())]
 
 
 def ranges(first: IntArray, lengths: IntArray) -> NDArray[np.int64]:
@@ -86,7 +94,7 @@ def sorted_order(keys: IntArray) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
     return order, is_new
 
 
-def first_indices(values: NDArray[np.int32], count: int) -> NDArray[np.int32]:
+def first_indices(values: IntArray, count: int) -> NDArray[np.int32]:
     """Return ``(count,)``: the lowest index of each of the values ``0 .. count - 1``, -1 for a missing value."""
     first = np.full(count, -1, dtype=np.int32)
     # Assigned backwards, as the last assignment to an entry is kept.

@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -98,6 +97,12 @@ class Signature:
     # one fan.
     fans: tuple[Fan, ...]
 
+    def __hash__(self) -> int:
+        # Kept, as signatures are keys of many caches, and fans take long to hash.
+        if "hash" not in vars(self):
+            vars(self)["hash"] = hash(self.fans)
+        return vars(self)["hash"]
+
     @property
     def sharpness(self) -> float:
         """Largest sharpness of all semi-sharp features; 0 if there are none."""
@@ -112,10 +117,6 @@ class Signature:
     def smoothed(self) -> Signature:
         """The signature without semi-sharp features."""
         return Signature(self.kind, tuple(fan.smoothed() for fan in self.fans)) if self.is_semi_sharp else self
-
-    def near(self) -> Signature:
-        """Return the signature without faces whose influence is negligible, see `Fan.near`."""
-        return Signature(self.kind, tuple(fan.near() for fan in self.fans))
 
     def rotated(self, corner: int) -> Signature:
         """Return the signature of the same element, named by a later corner, or face of its vertex."""
@@ -132,54 +133,57 @@ def signatures_at(
     topology: Topology,
     half_edges: IntArray,
     kind: ElementKind,
-    codes: IntArray | None = None,  # (n_h,) int: equal for equal fans only, by default `fan_codes`
+    codes: IntArray | None = None,  # (n_h,) int: codes of fans, if known, see `fan_codes`
+    *,
+    near: bool = False,  # Whether to leave out faces of negligible influence, see `Fan.near`
 ) -> list[Signature]:
     """Return the signatures of many elements. Equal ones are the same object."""
     counts = topology.face_sizes[topology.face[half_edges]] if kind == "face" else np.ones(len(half_edges), dtype=int)
     corners = topology.along_faces(half_edges, counts)
-    codes = (fan_codes(topology) if codes is None else codes)[corners]
-    _, first, number = np.unique(codes, return_index=True, return_inverse=True)
-    fans, numbers, signatures = _fans_at(topology, corners[first]), number.tolist(), dict[tuple[int, ...], Signature]()
-    keys = [tuple(numbers[begin:end]) for begin, end in pairwise(ragged.offsets(counts).tolist())]
-    for key in dict.fromkeys(keys):
-        signatures[key] = Signature(kind, tuple(fans[number] for number in key))
+    if codes is None:
+        fans, number = _fans_at(topology, corners)
+    else:
+        _, first, number = np.unique(codes[corners], return_index=True, return_inverse=True)
+        fans, fan = _fans_at(topology, corners[first])
+        number = fan[number]
+    fans, keys = [fan.near() for fan in fans] if near else fans, [*map(tuple, ragged.rows(number.tolist(), counts))]
+    signatures = {key: Signature(kind, tuple(fans[number] for number in key)) for key in dict.fromkeys(keys)}
     return [signatures[key] for key in keys]
 
 
-def _fans_at(topology: Topology, half_edges: IntArray) -> list[Fan]:
-    """Return the fans around the vertices at which half-edges begin, from the half-edges' faces on."""
-    t, semi = topology, topology.semi_sharpness
-    ahead, behind, is_closed = [half_edges], list[IntArray](), np.zeros(len(half_edges), dtype=bool)
-    while (ahead[-1] >= 0).any():
-        current = np.where(ahead[-1] < 0, -1, t.turn[ahead[-1]])
-        is_closed |= current == half_edges
-        ahead.append(np.where(current == half_edges, -1, current))
-    current = np.where(is_closed, -1, half_edges)
-    while (current >= 0).any():
-        current = np.where(current < 0, -1, t.turn_back[current])
-        behind.append(current)
-    # From the most clockwise half-edge on, -1 for none.
-    around = np.stack([*behind[::-1], *ahead], axis=1)
-    is_face, vertices = around >= 0, t.face_vertices[half_edges]
-    sizes = np.split(t.face_sizes[t.face[around[is_face]]], np.cumsum(is_face.sum(axis=1))[:-1])
-    behind_counts = is_face[:, : len(behind)].sum(axis=1).tolist()
-    fans = [
-        Fan(tuple(row[count:].tolist()), None if closed else tuple(row[:count][::-1].tolist()), VertexRule(rule))
-        for row, count, closed, rule in zip(
-            sizes, behind_counts, is_closed.tolist(), t.vertex_rules[vertices].tolist(), strict=True
-        )
-    ]
-    if semi is None:
-        return fans
-    for index in np.flatnonzero(t.is_semi_sharp_vertex[vertices]).tolist():
-        across, vertex = [], vertices[index]
-        if len(semi.across_vertex):
-            here = semi.across_vertex == vertex
-            columns = semi.across_sharpness[here], semi.across_refined[here], semi.across_sharpens[here]
-            across = sorted(zip(*(column.tolist() for column in columns), strict=True))
-        edges = tuple(map(tuple, t.edge_sharpness[around[index][is_face[index]]].tolist()))
-        fans[index] = fans[index]._replace(edges=edges, vertex=float(semi.vertices[vertex]), across=tuple(across))
-    return fans
+def _fans_at(topology: Topology, half_edges: IntArray) -> tuple[list[Fan], IntArray]:
+    """Return the fans around vertices, from a half-edge's face on: the different ones, and that of each half-edge."""
+    t, semi, vertices = topology, topology.semi_sharpness, topology.face_vertices[half_edges]
+    starts, face_counts = t.open_fan_start[vertices], t.vertex_face_count[vertices]
+    vertex_codes, face_codes = _vertex_codes(t), _face_codes(t)
+    fans, number = list[Fan](), np.empty(len(half_edges), dtype=np.int64)
+    for face_count in np.flatnonzero(np.bincount(face_counts)).tolist():
+        of_count = np.flatnonzero(face_counts == face_count)
+        is_open = starts[of_count] >= 0
+        rows = [np.where(is_open, starts[of_count], half_edges[of_count])]  # From the most clockwise half-edge on
+        for _ in range(face_count - 1):
+            rows.append(t.turn[rows[-1]])
+        around = np.stack(rows, axis=1)
+        behind = np.argmax(around == half_edges[of_count, None], axis=1)
+        columns = [vertex_codes[vertices[of_count]], is_open, behind, *(face_codes[row] for row in rows)]
+        _, first, which = np.unique(row_codes(columns), return_index=True, return_inverse=True)
+        number[of_count] = which + len(fans)
+        centres, around, begin = vertices[of_count[first]], around[first], len(fans)
+        facts = t.face_sizes[t.face[around]], behind[first], is_open[first], t.vertex_rules[centres]
+        for sizes, count, has_border, rule in zip(*(fact.tolist() for fact in facts), strict=True):
+            fans.append(Fan(tuple(sizes[count:]), tuple(sizes[:count][::-1]) if has_border else None, VertexRule(rule)))
+        if semi is None:
+            continue
+        for index in np.flatnonzero(t.is_semi_sharp_vertex[centres]).tolist():
+            across, vertex = [], centres[index]
+            if len(semi.across_vertex):
+                here = semi.across_vertex == vertex
+                features = semi.across_sharpness[here], semi.across_refined[here], semi.across_sharpens[here]
+                across = sorted(zip(*(feature.tolist() for feature in features), strict=True))
+            edges = tuple(map(tuple, t.edge_sharpness[around[index]].tolist()))
+            sharpness = float(semi.vertices[vertex])
+            fans[begin + index] = fans[begin + index]._replace(edges=edges, vertex=sharpness, across=tuple(across))
+    return fans, number
 
 
 def fan_codes(

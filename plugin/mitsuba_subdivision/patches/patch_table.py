@@ -92,7 +92,7 @@ class PatchTable:
     @cached_property
     def classes(self) -> tuple[PatchClass, ...]:
         """The classes of all patches, in the order of their codes."""
-        rings, corners = self.rings, np.split(self._patch_codes[0][self._order[0]], self._order[1])
+        rings, corners = self.rings, ragged.rows(self._patch_codes[0][self._order[0]], self.patch_counts)
         columns = self._signatures, corners, rings.vertex_counts.tolist(), rings.offsets[:-1].tolist()
         return tuple(PatchClass(*row) for row in zip(*columns, strict=True))
 
@@ -111,8 +111,8 @@ class PatchTable:
     def _signatures(self) -> list[Signature]:
         first = self._patch_codes[0][self._order[0][[0, *self._order[1]]]]
         half_edges = self.half_edge_of_corner[first]
-        signatures = signatures_at(self.topology, half_edges, self.scheme.element, self._patch_codes[2])
-        return [signature.near() for signature in signatures] if self.scheme.has_local_borders else signatures
+        kind, is_local = self.scheme.element, self.scheme.has_local_borders
+        return signatures_at(self.topology, half_edges, kind, self._patch_codes[2], near=is_local)
 
     @cached_property
     def rings(self) -> RingTable:
@@ -223,14 +223,16 @@ class PatchTable:
         t = self.elements
         dtypes = np.min_scalar_type(-self.class_count), np.int32, np.int8
         class_index, patch, patch_corner = (np.full(t.half_edge_count, -1, dtype=dtype) for dtype in dtypes)
-        corners, counts = self._patch_codes[0][self._order[0]], self.patch_counts
+        corners: IntArray = self._patch_codes[0][self._order[0]].astype(np.intp)
+        counts = self.patch_counts
         in_class, index = np.repeat(np.arange(len(counts)), counts), ragged.index_in_row(counts)
-        for turn in range(self.scheme.domain.corner_count):
-            class_index[corners], patch[corners], patch_corner[corners] = in_class, index, turn
-            if turn == 0:
-                is_whole = self.is_whole[t.face[corners]]
-                corners, in_class, index = corners[is_whole], in_class[is_whole], index[is_whole]
-            corners = t.next[corners]
+        class_index[corners], patch[corners], patch_corner[corners] = in_class, index, 0
+        if self.is_whole.any():
+            is_whole = self.is_whole[t.face[corners]]
+            corners, in_class, index = corners[is_whole], in_class[is_whole], index[is_whole]
+            for turn in range(1, self.scheme.domain.corner_count):
+                corners = t.next[corners]
+                class_index[corners], patch[corners], patch_corner[corners] = in_class, index, turn
         return class_index, patch, patch_corner
 
     @cached_property
@@ -243,14 +245,13 @@ class PatchTable:
             return begins, whole_codes, of_mesh
         corners: list[IntArray] = [begins]
         codes = [whole_codes]
-        partial = t.half_edges_of(~self.is_whole)
-        sizes = t.face_sizes[t.face[partial]]
-        for size in np.flatnonzero(np.bincount(sizes)).tolist():
-            corners.append(partial[sizes == size])
+        sizes = np.where(self.is_whole, 0, t.face_sizes)
+        for size in (1 + np.flatnonzero(np.bincount(sizes)[1:])).tolist():
+            corners.append(t.half_edges_of(sizes == size))
             # Codes of the fans at all corners, from the first one on, distinguish the signatures of patches.
             around = t.around_faces(corners[-1], 1 if self.scheme.element == "vertex" else size)
             first_unused = 1 + max(int(codes_of_size.max(initial=0)) for codes_of_size in codes)
-            codes.append(row_codes([fans[corner] for corner in around]).astype(np.int64) + first_unused)
+            codes.append(first_unused + row_codes([fans[corner] for corner in around]).astype(np.uint32))
         return np.concatenate(corners, dtype=np.int32), np.concatenate(codes), of_mesh
 
     def _turned_to_least(

@@ -219,7 +219,7 @@ def tree_arrays(
     # Regular pieces come before those of tips.
     maps, piece_count = [], 0
     parts, rows = _shared_parts(element)
-    all_stencils = [None] if rows is None else np.split(rows, np.cumsum([part.control_count for part in parts])[:-1])
+    all_stencils = [None] if rows is None else ragged.rows(rows, [part.control_count for part in parts])
     for part, stencils in zip(parts, all_stencils, strict=True):
         pieces = _regular_pieces(part)
         maps.append((piece_count, stencils, pieces))
@@ -233,7 +233,8 @@ def tree_arrays(
         coordinates = tip.coordinates[1:] @ piece.coordinates
         # Each piece begins with the first coordinate, as the weights of a piece's constant sum to one.
         width = of_levels.shape[1] - 1
-        stored = np.pad(coordinates, ((0, -len(coordinates) % width), (0, 0))).reshape(-1, width, coordinates.shape[1])
+        padding = np.zeros((-len(coordinates) % width, coordinates.shape[1]))
+        stored = np.concatenate([coordinates, padding]).reshape(-1, width, coordinates.shape[1])
         points = np.broadcast_to(piece.coordinates[0], (len(stored), 1, coordinates.shape[1]))
         pieces = np.concatenate([of_levels @ piece.coordinates, np.concatenate([points, stored], axis=1)])
         maps.append((piece_count, None, pieces))
@@ -273,6 +274,7 @@ def _tip(patch: IrregularPatch, piece_levels: int) -> tuple[Tip, FloatArray]:
     return tip, pieces.reshape(LEVEL_PIECES * piece_levels, *pieces.shape[2:])
 
 
+@lru_cache(maxsize=1024)
 def _shared_parts(element: PatchTree) -> tuple[list[PatchTree], FloatArray | None]:
     """Return the largest parts of at most `SHARED_PIECES` pieces, and all their stencils; None for a whole element."""
     if element.piece is not None or element.regular_count <= SHARED_PIECES:
