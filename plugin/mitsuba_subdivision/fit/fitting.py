@@ -125,7 +125,7 @@ class Fit(ABC):
                 complete = self._arrays()
                 if number % every == 0 or number == steps:
                     _save(checkpoint, complete)
-        except KeyboardInterrupt:
+        except (KeyboardInterrupt, RuntimeError):  # Ctrl-C is the cause of a RuntimeError where Dr.Jit traces a render.
             # Interruptions of callbacks come after the step.
             _save(checkpoint, self._arrays() if len(self.losses) > len(complete["losses"]) else complete)
             raise
