@@ -92,12 +92,6 @@ def test_new_positions_keep_class_and_topology_but_no_cached_values():
         cage.with_positions(np.where(np.arange(24).reshape(8, 3) == 16, np.nan, 0))
 
 
-def test_validation_errors_of_a_file_name_its_line(obj_file):
-    path = obj_file("# cube\nv 0 0 0\nv 1 0 0\nv 0 1 0\n\nf 1 2 3\nf 1 2 \\\n 3\n")
-    with pytest.raises(CageError, match=r'cube\.obj", line 6: face 1 and face 2 \(line 7\) .* edge \(1, 2\)'):
-        ControlCage.from_file(path, strict=True)
-
-
 def test_properties_are_mitsuba_tensors():
     mi, cage = mitsuba.scalar_rgb, torus(3, 4)
     properties = cage.as_properties(mi)

@@ -80,9 +80,6 @@ def shape(shading):
 """
 
 
-# Errors
-
-
 @every_array_variant
 def test_an_error_is_raised_once_by_its_cause(monkeypatch, capfd):
     shape = make(vertex_heat=upload(mi.TensorXf, np.arange(8.0)[:, None]))
@@ -195,8 +192,6 @@ def test_mitsuba_errors_are_the_same_in_both_shadings():
     assert list(errors("exact")) == list(errors("vertex"))
 
 
-# Interruptions
-
 INTERRUPTED = """
 import os, signal, threading, time
 # What runs in the background of a shell ignores interruptions otherwise.
@@ -233,9 +228,6 @@ for shading in ("vertex", "exact"):
 def test_an_interruption_is_raised_after_mitsuba_returns():
     turns = printed(BEGIN + INTERRUPTED).splitlines()
     assert [turn.split()[0] for turn in turns] == ["vertex"] * 2 + ["exact"] * 2
-
-
-# Frozen functions and instances
 
 
 @pytest.fixture
@@ -311,9 +303,6 @@ def test_instances_of_groups_side_by_side_are_as_placed_shapes():
     np.testing.assert_allclose(values, expected, atol=1e-4)
     np.testing.assert_allclose(values[3:6], normals, atol=1e-6)
     np.testing.assert_allclose(gradient, expected_gradient, atol=1e-3)
-
-
-# Lifetimes, variants and threads
 
 
 @every_array_variant
@@ -416,9 +405,6 @@ def test_the_log_counts_all_hits(monkeypatch):
         dr.eval(scene.ray_intersect(down([0.3] * count, 0.6, 3)).n)
     (text,) = logged
     assert f"of {count} hits, 100.00% are on the ray, 0.00% are along" in text
-
-
-# Where it cannot be
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """The command ``render``: models, frames, options, errors, denoising; and shading and triangles of its scenes."""
 
 import os
-import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -21,7 +20,7 @@ from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turnt
 from mitsuba_subdivision.studio.cage_scenes import CageScenes, Model
 from mitsuba_subdivision.studio.picture import ERRORS
 from mitsuba_subdivision.studio.studio_entries import Look
-from shapes.variants import exact, llvm, scalar
+from shapes.variants import exact, llvm, printed, scalar
 
 SCENES = Path(msub.example_file("human.xml")).parent
 SMALL = ["--size", "20x15", "--spp", "4", "--rate", "2", "-m", "scalar_rgb"]
@@ -84,7 +83,7 @@ from mitsuba_subdivision.__main__ import main
 words = "render sky.xml -m scalar_rgb --spp 2 -t 1 -o".split()
 raise SystemExit(main([*words, "a.exr"]) or main([*words, "b.exr", "--passes", "2"]))"""
     # Where all wait for a thread that there is not, they wait for ever.
-    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
+    printed(code)
     for name in ("a.exr", "b.exr"):
         np.testing.assert_allclose(pixels(name)[..., :3], 0.5, rtol=1e-3)
 

@@ -340,7 +340,7 @@ def test_warnings_of_all_frames_come_once(tmp_path):
     assert (len(shown), len(messages)) == (2, 2)
     messages.sort(key=len)
     assert "Points are ignored (/hair)" in messages[0]
-    assert "prim /fin: the faces are no manifold" in messages[1]
+    assert messages[1].startswith(f'"{path}", prim /fin: the faces are no manifold')
 
 
 def crossing(folder, opens, closes):

@@ -388,15 +388,6 @@ def test_a_mesh_that_its_scheme_cannot_subdivide_is_shown_as_polygons(scene, par
     np.testing.assert_array_equal(np.sort(corners.ravel()), [-1] * 12 + [1] * 12)
 
 
-def test_warnings_of_a_cage_come_once_and_name_its_prim(stage):
-    book = """int[] faceVertexCounts = [4, 4, 4]
-        int[] faceVertexIndices = [0, 1, 2, 3, 0, 1, 4, 5, 0, 1, 6, 7]
-        point3f[] points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (1, 0, 1), (0, 0, 1), (1, -1, 0), (0, -1, 0)]"""
-    path = stage(mesh("book", book))
-    loaded, (message,) = told(lambda: mi.load_dict(msub.usd_scene(path, mi)))
-    assert (message.partition(":")[0], loaded is None) == (f'"{path}", prim /book', False)
-
-
 def test_unusable_lights_warn_and_cameras_are_errors(scene):
     cube = mesh("cube", CUBE)
     for bad in ("token inputs:width = 'x'", "float inputs:width = 0", "float inputs:intensity = inf"):
