@@ -26,7 +26,8 @@ def test_all_forms_of_faces_agree():
     cage = ControlCage(positions, faces)
     assert_same(cage, ControlCage(positions.tolist(), faces.tolist()))
     assert_same(cage, ControlCage(positions.astype(np.float32), [tuple(face) for face in faces]))
-    assert_same(cage, ControlCage(positions, faces.astype(np.uint32)))
+    for kind in (np.int8, np.uint16, np.int32, np.uint32, np.int64, np.uint64):
+        assert_same(cage, ControlCage(positions, faces.astype(kind)))
     assert_same(cage, ControlCage.from_arrays(positions, [4] * 6, faces.ravel()))
     assert (cage.vertex_count, cage.face_count) == (8, 6)
     assert cage.positions.dtype == np.float64
