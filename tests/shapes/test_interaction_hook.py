@@ -440,18 +440,14 @@ def test_errors_state_why_a_shape_cannot_be_hooked(monkeypatch, place, value, me
     assert load(named_cages.cube()).face_count() > 0
 
 
+@pytest.mark.parametrize("version", [mi.__version__, "3.9.2"])
+@pytest.mark.parametrize("has_value_numbering", [True, False])
 @pytest.mark.usefixtures("variants_array_rgb", "no_hooks")
-def test_another_version_works_if_nothing_has_moved(monkeypatch):
-    monkeypatch.setattr(mi, "__version__", "3.9.2")
+def test_shapes_load_in_another_version_and_without_value_numbering(monkeypatch, version, has_value_numbering):
+    monkeypatch.setattr(mi, "__version__", version)
     # A class's table keeps what the first hook has put there.
     monkeypatch.setattr(interaction_hook.InteractionHook, "_tag_groups", lambda _: None)
-    assert hit(make(), *TOP).is_valid()
-
-
-@pytest.mark.usefixtures("variants_array_rgb", "no_hooks")
-def test_shapes_load_without_value_numbering(monkeypatch):
-    monkeypatch.setattr(interaction_hook.InteractionHook, "_tag_groups", lambda _: None)
-    with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, False):
+    with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, has_value_numbering):
         assert hit(make(), *TOP).is_valid()
 
 

@@ -269,7 +269,6 @@ def test_the_command_shows_and_saves_whole_stages(tmp_path, monkeypatch, capsys)
     first, second, third, again = (np.array(mi.Bitmap(name)).astype(int) for name in names)
     np.testing.assert_allclose(first, again, atol=1)
     assert min(np.abs(first - other).mean() for other in (second, third)) > 1
-    # Files of a frame each.
     for number in (1, 2):
         write(tmp_path, STILL, f"g_{number}.usda")
     of_files = f"render g_%d.usda -o g.png {small} --frames"

@@ -519,7 +519,6 @@ def test_colours_with_other_primaries_are_converted(tmp_path, primaries, expecte
     colors_of_file = read_texture_image(path).pixels[0]
     np.testing.assert_allclose(colors_of_file[:, :3], expected, atol=2e-4)
     np.testing.assert_array_equal(colors_of_file[:, 3:], colors[0, :, 3:])
-    # Data are what the file says.
     np.testing.assert_allclose(read_texture_image(path, "raw").pixels, colors, atol=1e-6)
 
 
@@ -1097,7 +1096,6 @@ def test_the_command_renders_the_whole_file(stage, tmp_path):
 
     # The stage's own light, which is hardly any, and not the studio's.
     assert brightest() < 1e-8
-    # One mesh in the studio.
     assert brightest("--prim", "/left") > 0.1
     brightest("--cage", status=1)
 
