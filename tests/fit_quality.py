@@ -19,7 +19,6 @@ import argparse
 import resource
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 # Before Mitsuba, so that Dr.Jit finds an LLVM library that works.
@@ -29,14 +28,17 @@ import mitsuba_subdivision as msub
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from kernels.surfaces import CAGES
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.figures.fit import LIGHTS, integrator
 from mitsuba_subdivision.fit import CageFit, Schedule, View
+from mitsuba_subdivision.fit.cage_fit import with_sample_count
 from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
+from reference.refined_cages import tagged
 from scipy.spatial import cKDTree
+from shapes.scenes import perspective, scene_with
 
-CAGES = Path(__file__).resolve().parents[1] / "scenes" / "cages"
 VIEWS, RESOLUTION, SPP, EDGE_SPP, TARGET_SPP = 8, 64, 16, 2, 512
 # Where cameras are, and how much more than the target they see.
 DISTANCE, MARGIN = 4.0, 1.05
@@ -232,16 +234,13 @@ def mesh_shape(mesh: Triangles) -> mi.Mesh:
 
 def pictures(target: Triangles, spp: int = TARGET_SPP) -> list[View]:
     """Of a target, by cameras around it, which it fills."""
-    scene, views = mi.load_dict({"type": "scene", **STAGE, "target": mesh_shape(target)}), []
+    scene, views = scene_with(**STAGE, target=mesh_shape(target)), []
     radius = np.linalg.norm(target.positions, axis=1).max()
     fov = float(np.degrees(2 * np.arcsin(MARGIN * radius / DISTANCE)))
-    film = {"type": "hdrfilm", "width": RESOLUTION, "height": RESOLUTION, "rfilter": {"type": "box"}}
-    film["sample_border"] = True
     for view in range(VIEWS):
         angle, rise = 2 * np.pi * view / VIEWS, np.radians(25) * (1 if view % 2 else -1)
         place = DISTANCE * np.array([np.cos(angle) * np.cos(rise), np.sin(angle) * np.cos(rise), np.sin(rise)])
-        to_world = mi.ScalarTransform4f().look_at(place.tolist(), [0, 0, 0], [0, 0, 1])
-        sensor = {"type": "perspective", "fov": fov, "to_world": to_world, "film": film}
+        sensor = perspective(RESOLUTION, place.tolist(), fov=fov)
         views.append(View(sensor, mi.render(scene, sensor=mi.load_dict(sensor), spp=spp, seed=1000 + view)))
     return views
 
@@ -259,12 +258,10 @@ def fitted_cage(target: Triangles, views: list[View], course: Course, seed: int,
 def fitted_mesh(target: Triangles, views: list[View], course: Course, seed: int, steps: int) -> Result:
     ball = ball_cage(DENSE, RADIUS * DIAGONAL)
     mesh = mesh_shape(Triangles.averaged(ball.positions, ball.triangles))
-    scene = mi.load_dict({"type": "scene", **STAGE, "mesh": mesh})
+    scene = scene_with(**STAGE, mesh=mesh)
     params, key = mi.traverse(scene), "mesh.vertex_positions"
     targets = [upload(mi.TensorXf, view.picture) for view in views]
-    cameras = [mi.load_dict(view.sensor) for view in views]
-    for camera in cameras:
-        camera.sampler().set_sample_count(SPP)
+    cameras = [with_sample_count(view.sensor, SPP) for view in views]
     large_steps = mi.ad.LargeSteps(params[key], params["mesh.faces"], MESH_LAMBDA)
     optimizer = mi.ad.Adam(lr=1.0, uniform=True)
     optimizer["u"] = large_steps.to_differential(params[key])
@@ -293,21 +290,17 @@ def fitted_creases(seed: int) -> tuple[float, float, float]:
     start = CUBE.with_positions(0.8 * CUBE.positions)
     # By how high their ends lie: below, uprights, above.
     sharpness = np.array([1.5, 0.8, 2.3])[(start.positions[start.edges, 2] > 0).sum(axis=1)]
-    box = tagged(start, sharpness).with_positions(start.positions * (1.1, 1.0, 0.9))
+    box = tagged(start, creases=np.column_stack([start.edges, sharpness]))
+    box = box.with_positions(start.positions * (1.1, 1.0, 0.9))
     views, peaks = pictures(Triangles.of_surface(box, 32), CREASE_TARGET_SPP), []
     options = {"shape": {"bsdf": BSDF, "tessellation_rate": 16}, "spp": CREASE_SPP, "seed": 1000 * seed, "smoothing": 0}
     options["learning_rate"] = [(0, 0.03), (CREASE_STEPS / 2, 0.03), (CREASE_STEPS, 0.001)]
     options["sharpness_rate"] = [(0, 0.3), (CREASE_STEPS / 2, 0.3), (CREASE_STEPS, 0.02)]
     options["callbacks"] = [lambda _: peaks.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)]
-    box_of_creases = tagged(start, np.full(len(sharpness), CREASE_START))
+    box_of_creases = tagged(start, creases=[(*edge, CREASE_START) for edge in start.edges])
     fit = CageFit(box_of_creases, views, STAGE, sharp_edges=start.edges, **options).run(CREASE_STEPS)
     errors = np.abs(fit.sharpness - sharpness)
     return errors.mean(), errors.max(), (peaks[-1] - peaks[50]) / 1024
-
-
-def tagged(cage: msub.ControlCage, sharpness: np.ndarray) -> msub.ControlCage:
-    creases = np.column_stack([cage.edges, sharpness])
-    return msub.ControlCage(cage.positions, cage.face_vertices.reshape(-1, 4), creases=creases)
 
 
 def compared(found: Triangles, target: Triangles, unknowns: int, seconds: np.ndarray) -> Result:

@@ -9,7 +9,6 @@ adaptive tessellation is the coarsest found, of pixel errors in steps of 3 %, wh
 """
 
 import argparse
-from pathlib import Path
 
 # Before Mitsuba, so that Dr.Jit finds an LLVM library that works.
 import mitsuba_subdivision
@@ -17,6 +16,7 @@ import mitsuba_subdivision
 # isort: split
 import mitsuba as mi
 import numpy as np
+from kernels.surfaces import CAGES
 from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.device_arrays import upload
 from mitsuba_subdivision.kernels.locations import TriangleLocations
@@ -24,8 +24,8 @@ from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
 from mitsuba_subdivision.tessellation.criterion import Criterion, Sensor
 from mitsuba_subdivision.tessellation.vertex_table import VertexTable
 from scipy.spatial import cKDTree
+from shapes.scenes import scene_with
 
-CAGES = Path(__file__).resolve().parents[1] / "scenes" / "cages"
 SURFACES = {
     **{name: (name, "catmull_clark") for name in ("human", "rook", "barrel", "propeller", "star")},
     **{"star, Doo-Sabin": ("star", "doo_sabin"), "star, Loop": ("star", "loop")},
@@ -130,7 +130,7 @@ class Outlines:
         beside = np.cross(seen, (end - begin)[which])
         beside /= np.maximum(np.linalg.norm(beside, axis=1), np.finfo(float).tiny)[:, None]
         mesh = mitsuba_mesh("outline", triangles, {"vertex_positions": positions})
-        scene = mi.load_dict({"type": "scene", "mesh": mesh})
+        scene = scene_with(mesh=mesh)
         is_free = np.full(len(points), False)
         for side in (BESIDE * self.pixel, -BESIDE * self.pixel):
             directions = upload(mi.Vector3f, seen + side * beside)

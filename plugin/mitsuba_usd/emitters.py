@@ -140,7 +140,6 @@ def _area(light: LightContents, area: float) -> SceneNode:
 
 
 def _world_radius(light: LightContents) -> float:
-    """Radius of a sphere, scaled by the mean of its axes."""
     return light.size[0] * abs(float(np.linalg.det(light.to_world[:3, :3]))) ** (1 / 3)
 
 

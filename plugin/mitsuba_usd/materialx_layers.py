@@ -113,7 +113,6 @@ def _beside(path: str, document: str) -> str:
 
 
 def _add_material(stage: Usd.Stage, node: MaterialX.Node) -> None:
-    """Add a material, with shaders that read its inputs."""
     import MaterialX
 
     path = stage.GetPrimAtPath("/MaterialX/Materials").GetPath().AppendChild(_prim_name(node.getName()))

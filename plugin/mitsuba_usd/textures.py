@@ -119,7 +119,6 @@ class Textures:
         return _linear_bitmap(values)
 
     def _bitmap(self, texture: TextureContents, picture: TextureImage, is_raw: bool) -> SceneNode:
-        """A texture of an image, in eight bits if possible."""
         pixels, channels = picture.pixels, texture.channels
         is_decoded = is_srgb_image(pixels, texture.color_space) and channels != [3]
         is_same = all(texture.scale[k] == 1 and texture.bias[k] == 0 for k in channels)

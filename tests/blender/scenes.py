@@ -249,7 +249,6 @@ def make_shown(model):
     group.links.new(group.nodes.new("GeometryNodeMeshCube").outputs["Mesh"], on_points.inputs["Instance"])
     cube("nodes", "NODES")[1].node_group = group
     cube("thick", "SUBSURF", "SOLIDIFY")
-    # What moves.
     key, _ = cube("key", "SUBSURF")
     key.shape_key_add(name="Basis")
     shape = key.shape_key_add(name="Larger")

@@ -124,7 +124,6 @@ def test_objects_are_placed_and_losses_printed(scene):
         matrix = turn @ matrix
     np.testing.assert_allclose(moved.positions, base.positions @ matrix.T + [1, 2, 3], atol=1e-6)
     assert 'object "Würfel 1.001": modifiers below "Subdivision" are left out: Thickness' in told
-    # Instances of a collection.
     for name, height in (("holder", 5), ("holder_001", 7)):
         np.testing.assert_allclose(cage_of(usda, name).positions, np.add(base.positions, [0, 0, height]), atol=1e-6)
     assert '"hidden"' not in usda.read_text(encoding="utf-8")

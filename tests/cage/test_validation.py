@@ -222,10 +222,7 @@ def test_numbers_have_all_their_digits():
         tagged(cube(), creases=[(0, 1, -1e-9)])
 
 
-def test_arrays_are_numbered_from_zero_and_files_name_the_line_and_their_own_numbers():
+def test_several_faces_are_numbered_from_zero_in_arrays_and_by_lines_in_files():
     array, file = CageSource(), CageSource('"cube.obj"', 1, np.array([2, 3]), np.array([5, 17]))
-    assert (array.at_face(4), array.at_vertex(0)) == ("control cage: face 4", "control cage: vertex 0")
-    assert (file.at_face(1), file.at_vertex(0)) == ('"cube.obj", line 17: face 2', '"cube.obj", line 2: vertex 1')
-    assert (array.edge(3, 7), file.edge(0, 1)) == ("edge (3, 7)", "edge (1, 2)")
     assert (array.faces(np.array([2])), array.faces(np.arange(10))) == ("face 2", "faces 0, 1, 2, 3, 4, 5 and 4 more")
     assert file.faces(np.array([0, 1])) == "faces 1 (line 5), 2 (line 17)"

@@ -235,9 +235,3 @@ def test_a_scheme_states_its_rules():
     silent.name = ""
     with pytest.raises(SchemeError, match="CatmullClark has no name"):
         register_scheme(silent)
-
-
-def test_faces_without_rules_are_named():
-    message = r"extraordinary\(5\): face 0 has 4 corners; the scheme loop expects triangles only"
-    with pytest.raises(SchemeError, match=message):
-        LimitSurface(extraordinary(5), "loop")

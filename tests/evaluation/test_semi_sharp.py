@@ -43,7 +43,6 @@ def assert_part(part, whole, faces):
     # Another patch may be the one that evaluates what they share with others.
     assert np.abs(part.positions[part.triangles] - whole.positions[kept]).max() <= POSITION
     assert np.abs(part.normals[part.triangles] - whole.normals[kept]).max() <= POSITION
-    # No vertex is left that no triangle uses.
     assert len(np.unique(part.triangles)) == len(part.positions)
 
 

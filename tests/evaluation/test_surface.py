@@ -113,8 +113,6 @@ def test_the_cages_scheme_is_the_default_and_unknown_schemes_are_errors():
         assert LimitSurface(cage, "catmull_clark").scheme.name == "catmull_clark"
     with pytest.raises(SchemeError, match='unknown scheme "odd"; known schemes: catmull_clark'):
         LimitSurface(ControlCage(tetrahedron().positions, faces, scheme="odd"))
-    with pytest.raises(SchemeError, match='unknown scheme "midpoint"; known schemes: catmull_clark'):
-        LimitSurface(cube(), scheme="midpoint")
 
 
 def test_schemes_are_shown_by_their_rules():

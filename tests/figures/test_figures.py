@@ -199,7 +199,6 @@ def test_figures_contain_version_command_and_cage(variant_llvm_ad_rgb, coarse, o
     assert [information[f"/{key}"] for key in ("Creator", "Subject", "Keywords")] == expected
     metadata = read_channels(paths[2])[1]
     assert [metadata[key] for key in ("version", "command", "cage")] == expected
-    # The command line understands it.
     assert parser().parse_args(metadata["command"].split()[1:]).cage == Path("own.obj")
 
 
@@ -255,7 +254,7 @@ def test_scalar_variants_draw_too_all_but_fits(options):
 
 @pytest.mark.usefixtures("variant_llvm_ad_rgb")
 def test_the_distance_of_spheres_is_the_difference_of_their_radii():
-    """Of two spheres around one point, the difference of their radii, but for gaps between samples."""
+    """But for gaps between samples."""
     inner, outer = (fit.ball_cage(4, radius) for radius in (0.5, 0.6))
     assert fit.distances(outer, [inner])[0] * fit.DIAGONAL == pytest.approx(0.1, rel=0.03)
 

@@ -312,7 +312,6 @@ def test_command(tmp_path, capsys):
     expected = LimitSurface(cube()).tessellate(2)
     np.testing.assert_array_equal(cage.positions, expected.positions.astype(np.float32))
     np.testing.assert_array_equal(cage.face_vertices, expected.triangles.ravel())
-    # With every digit.
     assert main([*words, str(tmp_path / "out.obj")]) == 0
     np.testing.assert_array_equal(ControlCage.from_file(tmp_path / "out.obj").positions, expected.positions)
     expected.save(tmp_path / "saved.obj")
@@ -323,11 +322,7 @@ def test_command_chooses_scheme_mesh_and_time(tmp_path, capsys):
     pytest.importorskip("pxr")
     text = ""
     for name, cage, scheme in (("cube", cube(), "catmullClark"), ("tetrahedron", tetrahedron(), "loop")):
-        points = {time: [*map(tuple, (time * cage.positions).tolist())] for time in (1, 2)}
-        statements = {"point3f[] points": points, "uniform token subdivisionScheme": f'"{scheme}"'}
-        statements["int[] faceVertexCounts"] = cage.face_sizes.tolist()
-        statements["int[] faceVertexIndices"] = cage.face_vertices.tolist()
-        text += stages.prim("Mesh", name, *(stages.stated(*row) for row in statements.items()))
+        text += stages.mesh_of(cage, name, {time: time * cage.positions for time in (1, 2)}, scheme)
     path = stages.write(tmp_path, text, "cages.usda")
     words = ["tessellate", str(path), "-o", str(tmp_path / "out.ply"), "--rate", "2"]
     assert main(words) == 1

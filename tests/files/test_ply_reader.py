@@ -60,7 +60,6 @@ def test_polygons(read):
     assert (cage.face_sizes.tolist(), cage.face_vertices.tolist()) == ([4, 3], [0, 1, 2, 3, 1, 4, 2])
     assert (cage.texcoords, cage.attributes, cage.scheme) == (None, {}, None)
     assert read(SHEET.replace("double y", "uchar y").replace("0.1", "1")).face_count == 2
-    # Other elements are skipped.
     edges = element("edge", 1, "int vertex1", "int vertex2")
     text = SHEET.replace("element face", edges + "element face").replace("4 0 1 2 3", "0 1\n4 0 1 2 3")
     assert read(text).face_count == 2

@@ -57,7 +57,6 @@ def test_meshes_need_only_points_and_faces(read):
     cage = read()
     np.testing.assert_array_equal(cage.positions, np.array(POINTS, dtype=np.float32))
     assert (cage.face_sizes.tolist(), cage.face_vertices.tolist()) == ([4, 4], [0, 1, 4, 3, 1, 2, 5, 4])
-    # USD's defaults.
     rules = cage.boundary, cage.face_varying, cage.triangle_rule
     assert rules == ("edge_and_corner", "corners_plus1", "catmull_clark")
     assert (cage.scheme, cage.crease_method) == ("catmull_clark", "uniform")
@@ -263,7 +262,6 @@ def test_one_of_several_meshes_is_chosen_by_its_path(read):
     ):
         with pytest.raises(CageError, match=message):
             read(more=more, prim=path)
-    # Of an instance.
     more = 'class "Model" {' + TRIANGLE.format("part") + "}\n"
     more += prim("Xform", "a", moved(translate=(5, 0, 0)), head="instanceable = true\ninherits = </World/Model>")
     positions = read(more=more, prim="/World/a/part").positions

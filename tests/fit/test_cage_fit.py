@@ -6,6 +6,8 @@ from mitsuba_subdivision import ControlCage, LimitSurface
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.fit import CageFit, View, fitting
 from reference.refined_cages import tagged
+from shapes.cages import described
+from shapes.scenes import perspective, scene_with
 
 pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 
@@ -20,19 +22,12 @@ ORDER = 1e-3
 ROUNDING = 1e-6
 
 
-def sensor(place):
-    film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}, "sample_border": True}
-    to_world = mi.ScalarTransform4f().look_at(place, [0, 0, 0], [0, 0, 1])
-    return {"type": "perspective", "fov": 40, "to_world": to_world, "film": film}
-
-
 PLACES = [(0, -5, 2), (5, 0, -1)]
 
 
 def views_of(cage, **shape):
-    shape = {"type": "subdivision", **cage.as_properties(mi), "tessellation_rate": 4, **shape}
-    scene = mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, **SKY, **LIGHT, "shape": shape})
-    sensors = [sensor(place) for place in PLACES]
+    scene = scene_with(integrator={"type": "direct"}, **SKY, **LIGHT, shape=described(cage, **shape))
+    sensors = [perspective(SIZE, place, fov=40) for place in PLACES]
     return [View(camera, mi.render(scene, sensor=mi.load_dict(camera), spp=256)) for camera in sensors]
 
 
@@ -243,7 +238,7 @@ PICTURE = np.zeros((SIZE, SIZE, 3))
 def test_invalid_fits_are_errors(changes, message):
     changes = {"views": [PICTURE], "masks": [None], "scene": SKY, **changes}
     given = zip(changes.pop("views"), changes.pop("masks"), strict=False)
-    views = [View(sensor(PLACES[0]), picture, mask) for picture, mask in given]
+    views = [View(perspective(SIZE, PLACES[0]), picture, mask) for picture, mask in given]
     with pytest.raises(ValueError, match=message):
         CageFit(cube(), views, changes.pop("scene"), **changes)
 

@@ -3,8 +3,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from mitsuba_subdivision import ControlCage
-from mitsuba_subdivision.cage import CageError
-from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.mesh.connectivity import paired
 from mitsuba_subdivision.refinement.cage_refinement import differences
 from patches.closed_cages import torus
@@ -30,19 +28,6 @@ def test_turns_pass_the_edge_before_and_back_the_edge_after(any_cage):
         assert t.turn[half_edge] == ahead
         assert t.turn_back[half_edge] == (-1 if behind < 0 else t.next[behind])
         assert ahead < 0 or t.turn_back[ahead] == half_edge
-
-
-def test_vertices_of_any_integer_type_are_the_same_cage():
-    expected = cube()
-    for kind in (np.int8, np.uint16, np.int32, np.uint32, np.int64, np.uint64):
-        faces = expected.face_sizes.astype(kind), expected.face_vertices.astype(kind)
-        cage = ControlCage.from_arrays(expected.positions, *faces)
-        np.testing.assert_array_equal(cage.face_vertices, expected.face_vertices)
-        np.testing.assert_array_equal(cage.topology.twin, expected.topology.twin)
-    wrong = expected.face_vertices.astype(np.uint64)
-    wrong[5] = 2**64 - 1
-    with pytest.raises(CageError, match="face 1 has the vertex index 18446744073709551615; expected 0 to 7"):
-        ControlCage.from_arrays(expected.positions, expected.face_sizes, wrong)
 
 
 def test_twin_is_the_same_edge_backwards_and_edges_are_numbered_without_gaps(any_cage):

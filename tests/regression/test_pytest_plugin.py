@@ -196,7 +196,6 @@ def test_undecided_comparisons_are_in_warnings_summary_and_junit(with_reference,
     told = "*paired: same samples, but *processor another here*the tile tier decides instead*"
     result.stdout.fnmatch_lines(["*warnings summary*", told, "*render differences: not decided*", told])
     assert "processor another here" in (with_reference.path / "junit.xml").read_text()
-    # A change is a failure in spite of that.
     with_reference.makefile(".xml", ball=SCENE.replace('"0.5"', '"0.505"'))
     failing(with_reference).stdout.fnmatch_lines(["*tile *fail*", "*compared all samples of the reference*"])
 

@@ -72,7 +72,6 @@ def test_the_page_has_one_picture_no_scripts_and_escaped_names(page):
     assert numbers["tiers"]["tile"]["failing"]
     channels, *_ = read_channels(page.parent / "maps.exr")
     assert np.abs(channels["z"][8:16, 8:16]).mean() > 5 * np.abs(channels["z"][20:, 20:]).mean()
-    # The index lists failures first.
     index = write_index(page.parent.parent).read_text()
     assert index.index("changed &lt;2&gt;") < index.index("unchanged")
     assert 'href="b/index.html"' in index
@@ -110,9 +109,7 @@ def test_the_picture_has_every_panel_with_its_colours_and_outlines(failed, repor
     evidence, angle = (panels[name].images[0] for name in ("Evidence against noise", "Angle between normals"))
     assert evidence.get_clim() == (0, failed.tier("tile").maps["evidence"].max())
     np.testing.assert_allclose(angle.norm([1e-5, 1e-2, 10]), [0, 0.5, 1])
-    # Silhouettes are grey.
     np.testing.assert_allclose(angle.to_rgba(np.ma.masked_invalid([np.nan]))[0], [0.55, 0.55, 0.55, 1])
-    # Tiles that fail are outlined.
     tiles = {(x["x"] - 0.5, x["y"] - 0.5, x["width"], x["height"]) for x in failed.tier("tile").numbers["failing"]}
     for name, expected in (("z-score", tiles), ("Evidence against noise", tiles), ("FLIP", set())):
         boxes = [patch for patch in panels[name].patches if isinstance(patch, Rectangle)]

@@ -14,7 +14,6 @@ def test_a_scheme_with_other_rules_is_a_copy():
     other = with_rules(usual, "chaikin", "smooth")
     assert (other.crease_method, other.triangle_rule) == ("chaikin", "smooth")
     assert with_rules(other, "chaikin", "smooth") is other
-    assert with_rules(usual, "uniform", "catmull_clark") is usual
 
 
 @pytest.mark.parametrize(

@@ -209,7 +209,6 @@ def test_coincident_vertices_stay_coincident(name, triangles, kind, shading):
 @pytest.mark.core
 @every_variant
 def test_a_crease_moves_by_the_mean_of_its_sides():
-    # All edges.
     sharp = [(a, a + bit, 10) for bit in (1, 2, 4) for a in range(8) if not a & bit]
     flat = cube(creases=sharp, attributes={"one": np.ones((8, 1))})
     (p, n), (before, _) = vertices(make(flat, "vertex_one")), vertices(make(flat, "vertex_one", displacement_scale=0.0))

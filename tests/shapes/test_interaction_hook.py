@@ -80,9 +80,6 @@ def shape(shading):
 """
 
 
-# Errors
-
-
 @every_array_variant
 def test_an_error_is_raised_once_by_its_cause(monkeypatch, capfd):
     shape = make(vertex_heat=upload(mi.TensorXf, np.arange(8.0)[:, None]))
@@ -195,8 +192,6 @@ def test_mitsuba_errors_are_the_same_in_both_shadings():
     assert list(errors("exact")) == list(errors("vertex"))
 
 
-# Interruptions
-
 INTERRUPTED = """
 import os, signal, threading, time
 # What runs in the background of a shell ignores interruptions otherwise.
@@ -233,9 +228,6 @@ for shading in ("vertex", "exact"):
 def test_an_interruption_is_raised_after_mitsuba_returns():
     turns = printed(BEGIN + INTERRUPTED).splitlines()
     assert [turn.split()[0] for turn in turns] == ["vertex"] * 2 + ["exact"] * 2
-
-
-# Frozen functions and instances
 
 
 @pytest.fixture
@@ -311,9 +303,6 @@ def test_instances_of_groups_side_by_side_are_as_placed_shapes():
     np.testing.assert_allclose(values, expected, atol=1e-4)
     np.testing.assert_allclose(values[3:6], normals, atol=1e-6)
     np.testing.assert_allclose(gradient, expected_gradient, atol=1e-3)
-
-
-# Lifetimes, variants and threads
 
 
 @every_array_variant
@@ -418,9 +407,6 @@ def test_the_log_counts_all_hits(monkeypatch):
     assert f"of {count} hits, 100.00% are on the ray, 0.00% are along" in text
 
 
-# Where it cannot be
-
-
 @pytest.fixture
 def no_hooks(monkeypatch):
     """As before the first shape, asking again whether one can be hooked."""
@@ -454,18 +440,14 @@ def test_errors_state_why_a_shape_cannot_be_hooked(monkeypatch, place, value, me
     assert load(named_cages.cube()).face_count() > 0
 
 
+@pytest.mark.parametrize("version", [mi.__version__, "3.9.2"])
+@pytest.mark.parametrize("has_value_numbering", [True, False])
 @pytest.mark.usefixtures("variants_array_rgb", "no_hooks")
-def test_another_version_works_if_nothing_has_moved(monkeypatch):
-    monkeypatch.setattr(mi, "__version__", "3.9.2")
+def test_shapes_load_in_another_version_and_without_value_numbering(monkeypatch, version, has_value_numbering):
+    monkeypatch.setattr(mi, "__version__", version)
     # A class's table keeps what the first hook has put there.
     monkeypatch.setattr(interaction_hook.InteractionHook, "_tag_groups", lambda _: None)
-    assert hit(make(), *TOP).is_valid()
-
-
-@pytest.mark.usefixtures("variants_array_rgb", "no_hooks")
-def test_shapes_load_without_value_numbering(monkeypatch):
-    monkeypatch.setattr(interaction_hook.InteractionHook, "_tag_groups", lambda _: None)
-    with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, False):
+    with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, has_value_numbering):
         assert hit(make(), *TOP).is_valid()
 
 

@@ -267,7 +267,6 @@ def test_a_file_is_read_once_until_it_changes_and_each_shape_warns(tmp_path, mon
     with monkeypatch.context() as patched:
         patched.setattr(ControlCage, "from_file", None)
         assert warned() is cages[0]
-    # Other options, another cage.
     assert warned(boundary="none", strict=True).boundary == "none"
     # Of the same size; and then at once again, as times of files are too coarse to tell whether it has changed since.
     for turn, age in ((-1, LONG_AGO // 2), (1, 0), (-1, 0)):

@@ -35,7 +35,6 @@ needs_llvm = pytest.mark.skipif(llvm_problem() is not None, reason="no usable LL
 def test_the_shape_is_there_in_any_order_of_imports_and_variants(order):
     llvm = [] if llvm_problem() else ["llvm_ad_rgb", "scalar_rgb", "llvm_ad_spectral"]
     again = "mitsuba_subdivision.register()\nassert faces() == [768], faces()\n"
-    # Back and forth.
     for variant in (*llvm, "scalar_spectral", "scalar_rgb") if order == "import between" else ():
         again += f"mi.set_variant('{variant}'); assert faces() == [768], '{variant}'\n"
     printed(f"{BEGIN}{ORDERS[order]}\nassert faces() == [768], faces()\n{again}")

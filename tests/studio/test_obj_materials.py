@@ -65,7 +65,6 @@ def test_unknown_materials_are_grey_and_warn(file):
     (file.parent / "cube.mtl").unlink()
     with pytest.warns(CageWarning, match=r'there is no material library "cube.mtl"; its materials are grey'):
         scene = studio_scene(file, **SMALL)
-    # One shape.
     assert "material" not in scene["surface"]
     assert "surface_2" not in scene
 

@@ -1,7 +1,6 @@
 """The command ``render``: models, frames, options, errors, denoising; and shading and triangles of its scenes."""
 
 import os
-import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -21,7 +20,8 @@ from mitsuba_subdivision.studio.animation import FrameRange, StillPicture, Turnt
 from mitsuba_subdivision.studio.cage_scenes import CageScenes, Model
 from mitsuba_subdivision.studio.picture import ERRORS
 from mitsuba_subdivision.studio.studio_entries import Look
-from shapes.variants import exact, llvm, scalar
+from shapes.variants import exact, llvm, printed, scalar
+from usd import stages
 
 SCENES = Path(msub.example_file("human.xml")).parent
 SMALL = ["--size", "20x15", "--spp", "4", "--rate", "2", "-m", "scalar_rgb"]
@@ -84,7 +84,7 @@ from mitsuba_subdivision.__main__ import main
 words = "render sky.xml -m scalar_rgb --spp 2 -t 1 -o".split()
 raise SystemExit(main([*words, "a.exr"]) or main([*words, "b.exr", "--passes", "2"]))"""
     # Where all wait for a thread that there is not, they wait for ever.
-    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, timeout=60)
+    printed(code)
     for name in ("a.exr", "b.exr"):
         np.testing.assert_allclose(pixels(name)[..., :3], 0.5, rtol=1e-3)
 
@@ -172,11 +172,7 @@ def test_limit_points_are_evaluated_once(monkeypatch):
 def test_times_of_a_usd_file_are_frames(folder):
     pytest.importorskip("pxr")
     cage = named_cages.cube()
-    points = ", ".join(f"{time}: {[*map(tuple, (time * cage.positions).tolist())]}" for time in (1, 5))
-    lines = f"""point3f[] points.timeSamples = {{ {points} }}
-        int[] faceVertexCounts = {cage.face_sizes.tolist()}
-        int[] faceVertexIndices = {cage.face_vertices.tolist()}"""
-    (folder / "m.usda").write_text(f'#usda 1.0\ndef Mesh "m" {{\n{lines}\n}}\n')
+    stages.write(folder, stages.mesh_of(cage, "m", {time: time * cage.positions for time in (1, 5)}), "m.usda")
     moving = frame_range(folder / "m.usda", Look(size=(20, 15), spp=4, rate=2), range(1, 6, 2))
     points = (mi.traverse(loaded.scene)["surface.control_points"] for loaded in moving.frames([1, 3, 5], None))
     np.testing.assert_allclose([np.abs(np.array(values)).max() for values in points], [1, 3, 5], rtol=1e-6)

@@ -231,7 +231,6 @@ def test_rods_and_balls_lie_around_edges_and_vertices():
     distance = np.linalg.norm(away, axis=2)
     nearest = distance.argmin(axis=1)
     np.testing.assert_allclose(distance.min(axis=1), radius, rtol=0.04)
-    # Outward.
     assert (away[np.arange(len(away)), nearest] * n[is_rod]).sum(axis=1).min() > 0
     shift = np.array([1.0, 2, 3])
     np.testing.assert_allclose(model.wire_points(cage.positions + shift), wire.positions + shift, atol=1e-12)
@@ -309,7 +308,6 @@ def test_vertex_colours_are_shown_without_a_checkerboard(tmp_path):
         return studio_scene(cage, **more, **SMALL)["surface"]["bsdf"]["bsdf"]["base_color"]["type"]
 
     assert kind(coloured("color", texcoords=msub.Attribute(np.zeros((8, 2)))), checker=True) == "checkerboard"
-    # Other numbers are no colours.
     assert kind(_with(attributes={"color": msub.Attribute(np.zeros((8, 1)))})) == "rgb"
 
 

@@ -122,5 +122,4 @@ def test_smooth_attributes_are_the_same_on_both_sides_of_a_crease(np_rng):
     mesh = LimitSurface(tagged(base, creases=creases, attributes={"weight": attribute})).tessellate(5)
     places = np.unique(mesh.positions, axis=0)
     assert len(places) < len(mesh.positions)
-    # Bit by bit.
     assert len(np.unique(np.hstack([mesh.positions, mesh.attributes["weight"]]), axis=0)) == len(places)

@@ -56,6 +56,14 @@ def bound(name="paint"):
     return f"rel material:binding = </{name}>"
 
 
+def mesh_of(cage, name, positions, scheme="catmullClark"):
+    """A mesh with the faces of a cage, and positions of its vertices by their times."""
+    points = {time: [*map(tuple, rows.tolist())] for time, rows in positions.items()}
+    faces = stated("int[] faceVertexCounts", cage.face_sizes.tolist())
+    faces += stated("int[] faceVertexIndices", cage.face_vertices.tolist())
+    return prim("Mesh", name, stated("point3f[] points", points), faces, f'token subdivisionScheme = "{scheme}"')
+
+
 def subset(faces, material="paint", name="part"):
     kind = 'uniform token elementType = "face"\nuniform token familyName = "materialBind"'
     return prim("GeomSubset", name, kind, f"int[] indices = {faces}", bound(material), apis=["MaterialBindingAPI"])

@@ -269,7 +269,6 @@ def test_the_command_shows_and_saves_whole_stages(tmp_path, monkeypatch, capsys)
     first, second, third, again = (np.array(mi.Bitmap(name)).astype(int) for name in names)
     np.testing.assert_allclose(first, again, atol=1)
     assert min(np.abs(first - other).mean() for other in (second, third)) > 1
-    # Files of a frame each.
     for number in (1, 2):
         write(tmp_path, STILL, f"g_{number}.usda")
     of_files = f"render g_%d.usda -o g.png {small} --frames"
@@ -340,7 +339,7 @@ def test_warnings_of_all_frames_come_once(tmp_path):
     assert (len(shown), len(messages)) == (2, 2)
     messages.sort(key=len)
     assert "Points are ignored (/hair)" in messages[0]
-    assert "prim /fin: the faces are no manifold" in messages[1]
+    assert messages[1].startswith(f'"{path}", prim /fin: the faces are no manifold')
 
 
 def crossing(folder, opens, closes):

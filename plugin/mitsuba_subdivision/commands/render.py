@@ -213,7 +213,6 @@ def _require_effect(options: argparse.Namespace, is_model: bool) -> None:
 
 
 def _refuse_contradictions(options: argparse.Namespace, by_passes: bool) -> None:
-    """Refuse outputs of an unknown format, and options that contradict each other or have no effect."""
     suffix, has_frames = options.output.suffix.lower(), options.turntable or options.frames
     has_other_filter, videos = options.filter not in (None, BOX), pictures.VIDEO_SUFFIXES
     all_options = "--pass, --passes, --dask or --reference"

@@ -101,7 +101,6 @@ def area_share(surface: LimitSurface, elements: NDArray[np.bool_]) -> float:
 
 
 def _polyhedron(cage: ControlCage, regular: NDArray[np.bool_]) -> mi.Mesh:
-    """The cage with flat faces, grey if they are irregular."""
     t = cage.topology
     # Every face becomes a fan of triangles around its centre, with separate vertices that have its normal.
     corners, centres = cage.positions[t.face_vertices], _centres(cage)
@@ -180,7 +179,6 @@ def _tagged(cage: ControlCage, name: str) -> ControlCage:
 
 
 def _cage_shapes(cage: ControlCage) -> SceneNode:
-    """Shapes of the cage: flat faces, and edges as rods, thick and coloured for creases."""
     # Each triangle has separate vertices, so that no normals are averaged.
     corners = cage.positions[cage.triangles.ravel()]
     mesh = staging.make_mesh(corners, np.arange(len(corners)).reshape(-1, 3), staging.paint(PALE))

@@ -109,7 +109,6 @@ def draw_fit(options: FigureOptions) -> list[Path]:
 
 
 def _target() -> ControlCage:
-    """A ball with six arms of different lengths, as triangles."""
     ball = ball_cage(FINE, 1.0)
     ends = np.array([(1, 0.1, 0), (-1, 0.2, 0.3), (0, 1, 0.2), (0.2, -1, 0), (0, 0.3, 1), (0.1, 0, -1)])
     ends /= np.linalg.norm(ends, axis=1, keepdims=True)

@@ -225,7 +225,6 @@ def _suffix(settings: _Settings) -> str:
 
 
 def _scene_of(metadata: dict[str, Any], path: Path) -> Path | None:
-    """The scene's file of a reference, if it is known and exists."""
     scene = (path.parent / metadata["scene"]).resolve() if "scene" in metadata else None
     return scene if scene is not None and scene.is_file() else None
 

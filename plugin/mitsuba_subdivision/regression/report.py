@@ -108,7 +108,6 @@ def _panels(comparison: Comparison) -> bytes:
 
 
 def _maps(comparison: Comparison) -> dict[str, NDArray[np.floating]]:
-    """The maps of all tiers, and if possible FLIP's for inspection."""
     maps = comparison.maps
     if "flip" not in maps:
         with suppress(RegressionError):

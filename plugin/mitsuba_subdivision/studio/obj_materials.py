@@ -60,7 +60,6 @@ def _file(folder: Path, name: str) -> Path:
 
 
 def _without_comment(line: str) -> str:
-    """A line without its comment, from a "#" at the start or between spaces."""
     return re.sub(r"(^#|\s#(?=\s|$)).*", "", line.strip()).strip()
 
 
