@@ -46,7 +46,6 @@ FOUR_TEXCOORDS = {"texcoords": np.zeros((4, 2))}
         ({"shown_faces": np.arange(0)}, 'parameter "shown_faces" shows no face; expected one at least'),
         ({"shown_faces": np.array([1]), "scheme": "doo_sabin"}, 'none for the scheme "doo_sabin", whose surface'),
         ({"texcoords": np.zeros((8, 3))}, 'parameter "texcoords" has shape (8, 3); expected (n, 2)'),
-        ({"texcoords": np.zeros((7, 2))}, 'attribute "texcoords" has 7 values; expected 8, one per vertex'),
         ({"texcoord_indices": np.zeros(24)}, 'parameter "texcoord_indices" needs "texcoords"'),
         ({**FOUR_TEXCOORDS, "texcoord_indices": np.full(24, 4)}, 'index 4 into attribute "texcoords"; expected 0 to 3'),
         ({**FOUR_TEXCOORDS, "texcoord_indices": np.arange(24) % 4, "scheme": "doo_sabin"}, "has no rules for seams"),
