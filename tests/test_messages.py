@@ -70,6 +70,7 @@ def test_warnings_name_no_place_in_the_code(folder, capsys):
     [
         ("info cube.obj --rate fine", '"fine"; expected an integer'),
         ("info cube.obj --rate 0", '"0"; expected an integer from 1 to 1024'),
+        ("info cube.obj --rate 100000000000", "expected an integer from 1 to 1024"),
         ("figure domains --width 8cm", '"8cm"; expected a width from 84mm to 1200mm, or in inches'),
         ("figure domains --width 3.3in", '"3.3in"; expected a width from 84mm'),
         ("render cube.obj -o a.png --size 0x4", '"0x4"; expected width and height of 1 or more'),

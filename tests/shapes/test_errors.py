@@ -27,6 +27,7 @@ FOUR_TEXCOORDS = {"texcoords": np.zeros((4, 2))}
         ({"tessellation_rate": 0}, 'parameter "tessellation_rate" is 0; expected 1 to 1024'),
         ({"tessellation_rate": 2.5}, 'parameter "tessellation_rate" is 2.5; expected an integer'),
         ({"scheme": "butterfly"}, 'parameter "scheme": unknown scheme "butterfly"; known schemes: catmull_clark'),
+        ({"scheme": ""}, 'parameter "scheme": unknown scheme ""; known schemes: catmull_clark'),
         ({"scheme": 3}, 'parameter "scheme" is 3; expected a string'),
         ({"shading": "automatic"}, 'parameter "shading" is "automatic"; expected one of vertex, exact, auto'),
         ({"flip_normals": "yes"}, "parameter \"flip_normals\" is 'yes'; expected true or false"),
