@@ -12,7 +12,6 @@ import numpy as np
 from mitsuba_subdivision import studio
 from mitsuba_subdivision.cage import CageContents, CageError, ControlCage
 from mitsuba_subdivision.mesh import IntArray, Topology
-from mitsuba_subdivision.mitsuba_mesh import box_corners, points_at
 from mitsuba_subdivision.schemes import SchemeError
 from mitsuba_subdivision.variants import SceneNode
 from numpy.typing import NDArray
@@ -132,10 +131,7 @@ def _edges(cage: CageContents) -> tuple[NDArray[np.float64], NDArray[np.float64]
 
 def pixels_of(cage: CageContents, to_world: NDArray[np.float64], seen: Views) -> float:
     """Maximum pixels per unit of a mesh, over its copies ``(n, 4, 4)`` and views."""
-    box = np.stack([cage.positions.min(axis=0), cage.positions.max(axis=0)]).astype(np.float64)
-    corners_of_copies = points_at(box_corners(box), to_world)
-    pixels = np.max([studio.pixels_of_boxes(corners_of_copies, *view) for view in seen], axis=0)
-    return float((np.linalg.norm(to_world[:, :3, :3], 2, axis=(1, 2)) * pixels).max())
+    return float(max(studio.pixels_of_copies(cage.positions, to_world, *view).max() for view in seen))
 
 
 def largest_height(shape: ShapeContents, textures: Textures, notes: StageWarnings) -> float:

@@ -198,8 +198,7 @@ class MaterialReader:
         if not UsdShade.Output.IsOutput(attribute):
             return self._value(attribute, kind, default)
         if kind in ("constant", "string"):
-            what = f"connections of {name} of {shader.GetShaderId()} to shaders are ignored"
-            self._notes.add(what, shader.GetPath())
+            self._notes.add(f"connections of {name} of {shader.GetShaderId()} to shaders are ignored", shader.GetPath())
             return default
         made = self._output(UsdShade.Shader(attribute.GetPrim()), attribute.GetBaseName())
         if made is not None and kind in nodes.CHANNELS:

@@ -47,15 +47,6 @@ def blender(script, *arguments, scene=None):
     return subprocess.run(command, capture_output=True, text=True, encoding="utf-8", timeout=100, check=False)
 
 
-def exported(kind, model, usda, other, *options):
-    """What an export of a scene tells, which Blender makes with another file."""
-    made = blender(SCENES, kind, model, other)
-    assert other.exists(), made.stdout + made.stderr
-    done = blender(SCRIPT, usda, *options, scene=model)
-    assert done.returncode == 0, done.stderr
-    return done.stderr
-
-
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """Makes a scene of a kind once: its export as USD, what Blender knows of it, and what the export tells."""
@@ -64,8 +55,11 @@ def made(tmp_path_factory):
     def make(kind):
         model = tmp_path_factory.mktemp(kind) / f"{kind}.blend"
         usda, other = model.with_suffix(".usda"), model.with_suffix(".json")
-        told = exported(kind, model, usda, other, *["--animation"] * (kind == "shown"))
-        return usda, json.loads(other.read_text()), told
+        done = blender(SCENES, kind, model, other)
+        assert other.exists(), done.stdout + done.stderr
+        done = blender(SCRIPT, usda, *["--animation"] * (kind == "shown"), scene=model)
+        assert done.returncode == 0, done.stderr
+        return usda, json.loads(other.read_text()), done.stderr
 
     return make
 

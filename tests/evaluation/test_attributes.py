@@ -71,10 +71,6 @@ def random_indices(cage, rng, kind):
     return np.where(rng.random(t.half_edge_count) < 0.05, 0, own)
 
 
-def textured(cage, indices, rng, **options):
-    return tagged(cage, texcoords=face_varying(rng.random((indices.max() + 1, 2)), indices), **options)
-
-
 def as_cage(points, texcoords, options):
     """Cage of points and texture coordinates that the reference has refined."""
     positions = {vertex: point for (vertex, _), point in points.values.items()}
@@ -152,8 +148,10 @@ def test_reference_refinements_have_the_same_points_and_values(scheme, cage, mod
     options = {"boundary": str(rng.choice(["edge_and_corner", "edge_only"])), "face_varying": mode}
     # As the reference states it; no triangles are left by a refinement.
     options["triangle_rule"] = "smooth" if scheme == "catmull_clark" and rng.random() < 0.5 else "catmull_clark"
-    tags = random_tags(cage, rng, share, sharpness)
-    coarse = textured(cage, random_indices(cage, rng, kind), rng, **tags, **options, crease_method=method)
+    options |= random_tags(cage, rng, share, sharpness)
+    indices = random_indices(cage, rng, kind)
+    texcoords = face_varying(rng.random((indices.max() + 1, 2)), indices)
+    coarse = tagged(cage, texcoords=texcoords, crease_method=method, **options)
     assert_refined_alike(coarse, scheme, refinements, rng)
 
 

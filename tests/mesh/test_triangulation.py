@@ -13,11 +13,6 @@ CONVEX = [[np.cos(a), np.sin(a)] for a in np.linspace(0, 6, 7)]
 SHAPES = {"arrow": ARROW, "horseshoe": HORSESHOE, "frame": FRAME, "spiral": SPIRAL, "convex": CONVEX}
 
 
-def signed_area(polygon):
-    x, y = np.asarray(polygon, dtype=float).T
-    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
-
-
 def turned(count, size, seed):
     """Rotations to any direction, and every first corner."""
     rng = np.random.default_rng(seed)
@@ -28,11 +23,12 @@ def turned(count, size, seed):
 @pytest.mark.parametrize("order", [1, -1], ids=["forward", "reversed"])
 def test_triangles_of_a_polygon_cover_its_area_once_with_its_orientation(polygon, order):
     flat = np.column_stack([polygon, np.zeros(len(polygon))])[::order]
-    one = np.array([len(flat)]), np.arange(len(flat))
+    one, (x, y, _) = (np.array([len(flat)]), np.arange(len(flat))), flat.T
+    area = (x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
     for rotation, start in turned(12, len(flat), 0):
         corners, face = triangle_corners(np.roll(flat, start, axis=0) @ rotation.T + 3, *one)
         a, b, c = (np.roll(flat, start, axis=0)[corner] for corner in corners.T)
-        areas, area = np.cross(b - a, c - a)[:, 2] / 2, signed_area(flat[:, :2])
+        areas = np.cross(b - a, c - a)[:, 2] / 2
         # Unsigned areas add up to the polygon's only if no triangle overlaps another, or lies outside.
         np.testing.assert_allclose([areas.sum(), np.abs(areas).sum()], [area, abs(area)], rtol=ROUNDING)
         assert not face.any()

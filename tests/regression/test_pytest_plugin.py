@@ -285,8 +285,6 @@ def test_scenes_of_any_kind_and_wrong_ones(project):
         @pytest.mark.parametrize(("given", "message"), [
             ({"name": None}, "has no name"),
             ({"name": "../x"}, "letters, digits"),
-            ({"tiers": ["pixels"]}, "unknown tier"),
-            ({"tolerances": {"x": 1}}, "unknown tolerance"),
             ({"variant": "scalar_x"}, "unknown variant"),
         ])
         def test_wrong(check, given, message):
@@ -294,8 +292,8 @@ def test_scenes_of_any_kind_and_wrong_ones(project):
                 check(scene(0.5), **given)
         """
     )
-    project.runpytest("--render-update-all", "-k", "test_dictionary").assert_outcomes(passed=1, deselected=6)
-    project.runpytest("-W", "error", "--render-report=none").assert_outcomes(passed=7)
+    project.runpytest("--render-update-all", "-k", "test_dictionary").assert_outcomes(passed=1, deselected=4)
+    project.runpytest("-W", "error", "--render-report=none").assert_outcomes(passed=5)
 
 
 def test_a_project_without_renders_imports_nothing_for_it(pytester):

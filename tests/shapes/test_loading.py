@@ -250,17 +250,13 @@ def from_file(path, **more):
     return mi.load_dict({"type": "subdivision", "filename": path, "tessellation_rate": 4, **more})
 
 
-def cage_of(shape):
-    return shape._parameters.surface.cage
-
-
 @every_variant
 def test_a_file_is_read_once_until_it_changes_and_each_shape_warns(tmp_path, monkeypatch):
     path, unused = tmp_path / "cube.obj", "v 9 9 9\n"
 
     def warned(**options):
         with pytest.warns(CageWarning, match="used by no face"):
-            return cage_of(from_file(str(path), **options))
+            return from_file(str(path), **options)._parameters.surface.cage
 
     written(cube(), path, more=unused)
     cages = [warned()]

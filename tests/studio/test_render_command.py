@@ -133,17 +133,13 @@ def test_missing_packages_name_the_extra(folder, capsys, monkeypatch, package, w
     assert list(folder.glob("*.png")) == []
 
 
-def moving_cages(folder):
-    """Files of a cage that moves, with other faces in the third."""
+@llvm
+def test_frames_equal_pictures_of_single_files(folder):
+    """Of a cage that moves, with other faces in the third."""
     cage = msub.ControlCage.from_file(SCENES / "cages" / "propeller.obj")
     for number in (1, 2, 3):
         moved = cage.with_positions(cage.positions + 0.3 * number * np.sin(cage.positions[:, [2, 0, 1]]))
         (moved.refined() if number == 3 else moved).save(folder / f"f_{number:02d}.obj")
-
-
-@llvm
-def test_frames_equal_pictures_of_single_files(folder):
-    moving_cages(folder)
     look = Look(size=(20, 15), spp=16, rate=2, up="z", cage=True)
     moving = frame_range(folder / "f_%02d.obj", look, range(1, 4))
     for number, loaded in zip((1, 2, 3), moving.frames([1, 2, 3], "box"), strict=True):

@@ -29,8 +29,7 @@ def figure(parser: CommandParser) -> None:
     add("--spp", type=positive, metavar="N", help="samples per pixel (default: 256, or 32 for artifact)")
     text = f"width on paper, as 84mm or 7in (default: {PAGE:g}mm, or {COLUMN:g}mm for figures of a column)"
     add("--width", type=_width, metavar="LENGTH", help=text)
-    text = f"one of {', '.join(BUILT_IN)} (default: catmull_clark)"
-    add("--scheme", choices=BUILT_IN, metavar="SCHEME", help=text)
+    add("--scheme", choices=BUILT_IN, metavar="SCHEME", help=f"one of {', '.join(BUILT_IN)} (default: catmull_clark)")
     takers = ", ".join(name for name, figure in FIGURES.items() if "cage" in figure.options)
     add("--cage", type=Path, metavar="FILE", help=f"a Catmull-Clark cage of your own, for {takers}")
     text = "png, pdf, exr or csv; can be repeated (default: all that the figure has)"

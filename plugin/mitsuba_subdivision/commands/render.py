@@ -136,8 +136,7 @@ def render(parser: CommandParser) -> None:
     )
     add("--shutter", type=_shutter, metavar="N", help=text)
     add("--fps", type=above_zero, metavar="N", help=f"frames per second of a video (default: {pictures.DEFAULT_FPS})")
-    text = 'reconstruction filter instead of the scene\'s; "box" is deterministic'
-    parser.add_argument("--filter", help=text)
+    parser.add_argument("--filter", help='reconstruction filter instead of the scene\'s; "box" is deterministic')
     text = "The image is an OpenEXR file with the variance and the number of samples of each pixel."
     passes = parser.add_argument_group("rendering by passes", text)
     add = passes.add_argument

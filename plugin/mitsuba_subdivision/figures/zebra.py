@@ -67,9 +67,8 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
         # Colour bands that differ from the exact surface's.
         wrong = np.clip(np.abs(drawn - pixels["exact"])[..., :3].mean(axis=-1, keepdims=True) / (LIGHT - DARK), 0, 1)
         marked = (1 - wrong) * staging.on_white(drawn) + wrong * WRONG
-        (title, caption), share = titles[name], f"{100 * wrong.mean():.1f} % wrong"
-        caption = f"{caption}\n{'reference' if name == 'exact' else share}"
-        show(axis, marked.round().astype(np.uint8), title, caption)
+        (title, caption), share = titles[name], "reference" if name == "exact" else f"{100 * wrong.mean():.1f} % wrong"
+        show(axis, marked.round().astype(np.uint8), title, f"{caption}\n{share}")
     largest = max(angle.max() for angle in angles.values()) or 1
     for axis, angle in zip(axes[1, 1:], angles.values(), strict=True):
         shown = axis.imshow(angle, cmap="magma_r", vmin=0, vmax=largest, interpolation="nearest")

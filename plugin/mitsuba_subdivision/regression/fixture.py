@@ -178,8 +178,7 @@ class RenderRegression:
     def _claim(self, path: Path, scene: SceneSource, settings: _Settings) -> None:
         """Fail if another scene of this run has the same reference; record this one for pytest's summary."""
         words = f"{scene if isinstance(scene, Path) else 'a scene in memory'}{_suffix(settings)}"
-        claims = self.node.config.stash.setdefault(CLAIMS, {})
-        other, test = claims.setdefault(path, (words, self.node.nodeid))
+        other, test = self.node.config.stash.setdefault(CLAIMS, {}).setdefault(path, (words, self.node.nodeid))
         if other != words:
             pytest.fail(f'"{path}" is the reference of "{other}" in {test}, and of "{words}" here; {NAME}', False)
         self.node.user_properties.append(("render_reference", os.path.relpath(path, self.references)))

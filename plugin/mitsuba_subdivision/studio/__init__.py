@@ -10,7 +10,7 @@ from .picture import (
     MOST_TRIANGLES,
     highest_rate,
     outline_for,
-    pixels_of_boxes,
+    pixels_of_copies,
     render_denoised,
     segments_for,
     set_light_weights,
@@ -36,7 +36,7 @@ from .studio_entries import (
 __all__ = [
     "AOVS", "DEFAULT_SIZE", "DEFAULT_SPP", "DEFAULT_VIEW", "ENVIRONMENT", "ERRORS", "HIGHEST_RATE", "MOST_SEGMENTS",
     "MOST_TRIANGLES", "STUDIO", "LoadedScene", "Look", "SceneSource", "StillPicture", "View", "enlargement", "finished",
-    "frame_table", "highest_rate", "load_quietly", "outline_for", "pixels_of_boxes", "render_denoised", "sampler",
+    "frame_table", "highest_rate", "load_quietly", "outline_for", "pixels_of_copies", "render_denoised", "sampler",
     "segments_for", "set_light_weights", "set_parameters", "shading_for", "studio", "studio_scene", "triangles_for",
     "weigh_lights",
 ]  # fmt: skip

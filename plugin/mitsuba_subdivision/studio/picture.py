@@ -62,10 +62,7 @@ def segments_for(
     shading: str,
 ) -> NDArray[np.int64]:
     """Rates ``(n,)`` of a cage's copies, up to `FINEST_RATE`, without visible facets in an image."""
-    box = np.array([(x.min(), x.max()) for x in cage.positions.T]).T
-    stretch = np.linalg.norm(to_world[:, :3, :3], 2, axis=(1, 2))
-    corners = points_at(box_corners(box), to_world)
-    error = _deviation(cage, shading) * stretch * pixels_of_boxes(corners, outline, near_clip)
+    error = _deviation(cage, shading) * pixels_of_copies(cage.positions, to_world, outline, near_clip)
     # Twice the rate has a quarter of the distance.
     segments = np.ceil(np.sqrt(np.minimum(error / ERRORS[shading], FINEST_RATE**2)))
     return np.maximum(1, segments.astype(np.int64))
@@ -117,15 +114,18 @@ def _deviation(cage: ControlCage, shading: str) -> float:
     return float(np.sqrt(np.quantile(squared, MOST_VERTICES[shading])) / 2)
 
 
-def pixels_of_boxes(corners: NDArray[np.float64], outline: SceneNode, near_clip: float) -> NDArray[np.float64]:
-    """Maximum pixels per world unit inside each box, with corners ``(n, 8, 3)``."""
+def pixels_of_copies(
+    points: NDArray, to_world: NDArray[np.float64], outline: SceneNode, near_clip: float
+) -> NDArray[np.float64]:
+    """Maximum pixels per unit of a mesh with these points, for each of its copies ``(n, 4, 4)``."""
+    stretch = np.linalg.norm(to_world[:, :3, :3], 2, axis=(1, 2))
     matrix = np.array(outline["sensor_to_world"].matrix, dtype=np.float64).reshape(4, 4)
     if not outline["sensor_fov"]:
-        return np.full(len(corners), outline["film_width"] / (2 * np.linalg.norm(matrix[:3, 0])))
-    half_width = math.tan(math.radians(outline["sensor_fov"]) / 2)
-    from_world = np.linalg.inv(matrix)
-    depth = corners @ from_world[2, :3] + from_world[2, 3]
-    return np.asarray(outline["film_width"] / (2 * half_width * np.maximum(depth.min(axis=1), near_clip)))
+        return stretch * outline["film_width"] / (2 * np.linalg.norm(matrix[:3, 0]))
+    half_width, from_world = math.tan(math.radians(outline["sensor_fov"]) / 2), np.linalg.inv(matrix)
+    box = np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float64)
+    depth = points_at(box_corners(box), to_world) @ from_world[2, :3] + from_world[2, 3]
+    return stretch * outline["film_width"] / (2 * half_width * np.maximum(depth.min(axis=1), near_clip))
 
 
 def weigh_lights(scene: mi.Scene, sensor: int = 0) -> bool:
