@@ -20,7 +20,7 @@ from ..mesh.one_ring import one_ring
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme
 from .irregular_patch import rest_rows
-from .patch_tree import PartKind, PatchTree, patch_tree, refined_children
+from .patch_tree import PartKind, PatchTree, refine
 from .polynomials import polynomial_basis
 
 # Number of divisions before a tile is bounded by its pieces and the parts that are still undivided. For surfaces it
@@ -50,11 +50,8 @@ class DividedTile:
         """The children, in the order of `ParameterDomain.children`, as returned by `part_of_tile`."""
         if self._element is None:
             return tuple((self, rows) for rows in self._bernstein.halves)
-        children = self._element.children
-        if self.is_self_similar:
-            (refined,) = refined_children(self._scheme, [self._element.signature])
-            children = [(patch_tree(self._scheme, child.signature), child.stencils) for child in refined]
-        return tuple(part_of_tile(child, stencils) for child, stencils in children)
+        refine([self._element])
+        return tuple(part_of_tile(child, stencils) for child, stencils in self._element.refined)
 
     @cached_property
     def corners(self) -> FloatArray:

@@ -27,7 +27,6 @@ from ..mesh.one_ring import RingTable, joined_rings, one_ring, one_rings
 from ..mesh.signature import Fan, Signature, signatures_at
 from ..schemes.domain import IDENTITY, FloatArray, ParameterMap
 from ..schemes.scheme import Scheme, SchemeError
-from .equations import times_matrix
 from .irregular_patch import IrregularPatch
 
 # Number of control points of the one-rings that are refined together, which bounds memory to tens of megabytes.
@@ -101,11 +100,9 @@ class PatchTree:
     @property
     def children(self) -> list[tuple[PatchTree, FloatArray]]:
         """All children with their stencils over the element's control points, ``(K_child, K)``; empty for a piece."""
-        if self.piece is not None:
-            return []
-        if not self.refined:
+        if self.piece is None and not self.refined:
             refine([self])
-        return self.refined
+        return self.refined if self.piece is None else []
 
     @cached_property
     def regular_count(self) -> int:
@@ -162,16 +159,12 @@ class PatchTree:
         """Compute coefficients of the regular pieces over the element's one-ring. Returns (r, m, K)."""
         if self.piece is not None and self.piece.patch is None:
             return (form @ self.piece.stencils)[None]
-        known, begin = {} if known is None else known, 0
-        coefficients = np.empty((self.regular_count, len(form), self.control_count))
+        known, coefficients = {} if known is None else known, [np.empty((0, len(form), self.control_count))]
         for child, stencils in self.children:
             if child not in known:
                 known[child] = child.coefficients(form, known)
-            end = begin + child.regular_count
-            flat = (part.reshape(1, -1, part.shape[2]) for part in (known[child], coefficients[begin:end]))
-            times_matrix(next(flat), stencils, out=next(flat))
-            begin = end
-        return coefficients
+            coefficients.append(known[child] @ stencils)
+        return np.concatenate(coefficients)
 
 
 # The limit is several times the number of elements of a cage with some hundred classes of semi-sharp one-rings.
@@ -362,10 +355,9 @@ def rotation_order(signature: Signature, corner: int) -> IntArray:
 @lru_cache(maxsize=1024)
 def irregular_patch(scheme: Scheme, signature: Signature) -> IrregularPatch | None:
     """Return the patch of a self-similar one-ring: child 0 has its signature, all others are regular; else None."""
-    count = len(scheme.domain.children)
     refine([element := patch_tree(scheme, signature)])
     (first, matrix), *others = element.refined
-    if len(others) != count - 1 or first.signature != signature:
+    if len(others) != len(scheme.domain.children) - 1 or first.signature != signature:
         return None
     regular_stencils = []
     for child, stencils in others:

@@ -31,8 +31,7 @@ STEPS_IN_ROUND = 3
 LONGEST_STEP = 0.5
 # Tolerance of a Newton step's length, in parameters of a piece: a next step would be about as long as its square.
 STEP_TOLERANCE = 3e-4
-# Largest overshoot of a border by rounding, in parameters of a piece. A larger one means that the border stops the
-# search.
+# Largest overshoot of a border by rounding, in parameters of a piece. At a larger one the border stops the search.
 BEYOND_BORDER = 1e-6
 # Successive aims of the search; the `kind` of a hit is the aim that succeeded.
 ON_LINE, ON_NORMAL, MISSED = range(3)
@@ -64,8 +63,7 @@ class _Search(NamedTuple):
     aim: Index
     is_done: Mask
     rounds: Index  # Number of rounds with this aim
-    # Non-zero after a hit on the wrong side: the next step leads along the surface, in the direction of the line if
-    # positive, or against it
+    # Non-zero after a hit on the wrong side: the next step is along the surface, with the line if positive, or against
     side: Float
     is_held: Mask  # Lanes that a border has stopped in the last round
     # Location
@@ -125,8 +123,7 @@ def line_hits(
         target = walk.carried(unclamped, active & is_finite, row)
         du, dv = target.u - here.u, target.v - here.v
 
-        # Tolerance of the step's length, in parameters of a piece: rounding errors exceed `STEP_TOLERANCE` next to
-        # extraordinary points.
+        # Tolerance of the step's length, in a piece's parameters: errors near extraordinary points are larger.
         coordinate_size = dr.sqrt(dot(p, p)) + dr.sqrt(dot(surface.value, surface.value))
         longest_derivative = dr.sqrt(dr.maximum(dot(surface.du, surface.du), dot(surface.dv, surface.dv)))
         last_step = dr.clip(

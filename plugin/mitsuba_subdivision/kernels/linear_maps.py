@@ -152,8 +152,7 @@ class WeightBlocks:
         # controls of a patch, and its first row of weights, of which each control point has one
         columns: np.ndarray,
         controls: IndexBuffer,  # Indices of control points
-        # (l,) int: block and patch of each lane. Lanes of a block are mostly consecutive, so that they read the same
-        # weights.
+        # (l,) int: block and patch of each lane. Lanes of a block are mostly consecutive, and read the same weights.
         block: np.ndarray,
         patch: np.ndarray,
         # (l,) int: which piece each lane writes, in an array of pieces of this many vectors

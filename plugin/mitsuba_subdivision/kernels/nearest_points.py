@@ -16,8 +16,7 @@ from .piece_kernel import PatchValues, Piece
 STEPS = 40
 # Tolerance of a step's length in double precision, as `STEP_TOLERANCE`: derivatives depend on it.
 STEP_TOLERANCE_DOUBLE = 1e-7
-# Factor that shortens a step that has increased the distance; lengths, in parameters of a piece, below which the search
-# stops instead.
+# Factor of a step that has increased the distance; lengths, in parameters of a piece, below which the search stops.
 SHORTER, GIVEN_UP_SINGLE, GIVEN_UP_DOUBLE = 0.25, 1e-6, 1e-12
 # Least determinant of the second derivatives of half the squared distance, relative to the product of the squared
 # lengths of the tangents. Below it, a Gauss-Newton step replaces Newton's; its damping, relative to these squared

@@ -171,8 +171,7 @@ class SurfaceKernel:
         vector3 = self.types.vector3
         o, d = vector3(ray.o), vector3(ray.d)
         start = self._location(element, uv, corner)
-        # Start from the projection of the starting point onto the line: single precision loses digits over long
-        # distances.
+        # Start from the projection of the starting point onto the line: long distances lose digits.
         direction, origin = dr.detach(d), dr.detach(o)
         projection = self.at(start, moves=False).p - origin
         projection = origin + direction * (dr.dot(projection, direction) / dr.squared_norm(direction))
@@ -285,8 +284,7 @@ class SurfaceKernel:
         active: Mask = True,
         derivatives: int = 1,  # 2 adds the derivatives of the normals
         *,
-        # Lines whose hits the points are, or points that they are nearest to: derivatives then follow these, else the
-        # location is fixed.
+        # Lines hit at the points, or points that they are nearest to, which derivatives follow; by default none
         constraint: Lines | NearestPoints | None = None,
         moves: bool = True,  # Whether results are attached to the control points and the displacement
         known: PatchValues | None = None,  # Values of `line_hits`: save the evaluation where nothing is differentiated

@@ -38,8 +38,7 @@ class SemiSharpness:
     semi-sharp edge *across* the cut, which ends at another copy of the vertex.
     """
 
-    # (n_h,) float64: sharpness of the edge of each half-edge, equal for both half-edges of an edge. 0 for smooth edges
-    # and on borders.
+    # (n_h,) float64: sharpness of the edge of each half-edge, equal for twins; 0 for smooth edges and on borders
     edges: FloatArray
     # (n_h,) float64: sharpness after the next refinement of the half of the edge at the origin of the half-edge
     edges_refined: FloatArray
@@ -48,8 +47,7 @@ class SemiSharpness:
     across_sharpness: FloatArray  # (m,) float64: sharpness of the edge
     # (m,) float64: sharpness after the next refinement of the half of the edge at the vertex
     across_refined: FloatArray
-    # (m,) bool: whether the edge makes the vertex sharp. If not, it only contributes to the averages of Chaikin's
-    # method.
+    # (m,) bool: whether the edge makes the vertex sharp; others only contribute to the averages of Chaikin's method
     across_sharpens: NDArray[np.bool_]
 
     @classmethod

@@ -166,8 +166,7 @@ def _split_vertices(
 ) -> tuple[NDArray[np.int32], IntArray]:
     """Create a copy of a vertex for each of its sides: ``face_vertices`` of the cut mesh, and `CutMesh.vertex`."""
     t = mesh.topology
-    # Counter-clockwise, a side begins at an outgoing border edge. A closed fan is a side, too, if the vertex has other
-    # fans.
+    # Counter-clockwise, a side begins at an outgoing border edge. A closed fan beside other fans is a side, too.
     begins = np.flatnonzero(is_border)
     if mesh.non_manifold is not None:
         closed_fans = mesh.non_manifold.closed_fans

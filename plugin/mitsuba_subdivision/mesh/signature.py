@@ -93,8 +93,7 @@ class Signature:
     """Shape of a one-ring, from the half-edge of the element on. Equal signatures have the same limit stencils."""
 
     kind: ElementKind
-    # For a face, the fans at its corners, counter-clockwise, each with the element as the first face. For a vertex, its
-    # one fan.
+    # Of a face, the fans at its corners, counter-clockwise, which begin with the element; the one fan of a vertex
     fans: tuple[Fan, ...]
 
     def __hash__(self) -> int:
@@ -140,13 +139,11 @@ def signatures_at(
     """Return the signatures of many elements. Equal ones are the same object."""
     counts = topology.face_sizes[topology.face[half_edges]] if kind == "face" else np.ones(len(half_edges), dtype=int)
     corners = topology.along_faces(half_edges, counts)
-    if codes is None:
-        fans, number = _fans_at(topology, corners)
-    else:
-        _, first, number = np.unique(codes[corners], return_index=True, return_inverse=True)
-        fans, fan = _fans_at(topology, corners[first])
-        number = fan[number]
-    fans, keys = [fan.near() for fan in fans] if near else fans, [*map(tuple, ragged.rows(number.tolist(), counts))]
+    codes = corners if codes is None else codes[corners]
+    _, first, which = np.unique(codes, return_index=True, return_inverse=True)
+    fans, number = _fans_at(topology, corners[first])
+    fans = [fan.near() for fan in fans] if near else fans
+    keys = [*map(tuple, ragged.rows(number[which].tolist(), counts))]
     signatures = {key: Signature(kind, tuple(fans[number] for number in key)) for key in dict.fromkeys(keys)}
     return [signatures[key] for key in keys]
 
@@ -155,8 +152,7 @@ def _fans_at(topology: Topology, half_edges: IntArray) -> tuple[list[Fan], IntAr
     """Return the fans around vertices, from a half-edge's face on: the different ones, and that of each half-edge."""
     t, semi, vertices = topology, topology.semi_sharpness, topology.face_vertices[half_edges]
     starts, face_counts = t.open_fan_start[vertices], t.vertex_face_count[vertices]
-    vertex_codes, face_codes = _vertex_codes(t), _face_codes(t)
-    fans, number = list[Fan](), np.empty(len(half_edges), dtype=np.int64)
+    vertex_codes, fans, number = _vertex_codes(t), list[Fan](), np.empty(len(half_edges), dtype=np.int64)
     for face_count in np.flatnonzero(np.bincount(face_counts)).tolist():
         of_count = np.flatnonzero(face_counts == face_count)
         is_open = starts[of_count] >= 0
@@ -165,7 +161,8 @@ def _fans_at(topology: Topology, half_edges: IntArray) -> tuple[list[Fan], IntAr
             rows.append(t.turn[rows[-1]])
         around = np.stack(rows, axis=1)
         behind = np.argmax(around == half_edges[of_count, None], axis=1)
-        columns = [vertex_codes[vertices[of_count]], is_open, behind, *(face_codes[row] for row in rows)]
+        face_codes = _face_codes(t, np.concatenate(rows)).reshape(face_count, -1)
+        columns = [vertex_codes[vertices[of_count]], is_open, behind, *face_codes]
         _, first, which = np.unique(row_codes(columns), return_index=True, return_inverse=True)
         number[of_count] = which + len(fans)
         centres, around, begin = vertices[of_count[first]], around[first], len(fans)
@@ -175,14 +172,12 @@ def _fans_at(topology: Topology, half_edges: IntArray) -> tuple[list[Fan], IntAr
         if semi is None:
             continue
         for index in np.flatnonzero(t.is_semi_sharp_vertex[centres]).tolist():
-            across, vertex = [], centres[index]
-            if len(semi.across_vertex):
-                here = semi.across_vertex == vertex
-                features = semi.across_sharpness[here], semi.across_refined[here], semi.across_sharpens[here]
-                across = sorted(zip(*(feature.tolist() for feature in features), strict=True))
+            here = semi.across_vertex == centres[index]
+            features = semi.across_sharpness[here], semi.across_refined[here], semi.across_sharpens[here]
+            across = tuple(sorted(zip(*(feature.tolist() for feature in features), strict=True)))
             edges = tuple(map(tuple, t.edge_sharpness[around[index]].tolist()))
-            sharpness = float(semi.vertices[vertex])
-            fans[begin + index] = fans[begin + index]._replace(edges=edges, vertex=sharpness, across=tuple(across))
+            sharpness = float(semi.vertices[centres[index]])
+            fans[begin + index] = fans[begin + index]._replace(edges=edges, vertex=sharpness, across=across)
     return fans, number
 
 
@@ -255,13 +250,13 @@ def _vertex_codes(topology: Topology) -> IntArray:
     return row_codes([t.vertex_rules, *map(_value_codes, columns)])
 
 
-def _face_codes(topology: Topology) -> IntArray:
-    """``(n_h,)`` code of each half-edge's face and edge: the size of the face, the sharpness of the edge."""
-    t = topology
-    size = np.broadcast_to(t.common_size, t.half_edge_count) if t.common_size else t.face_sizes[t.face]
+def _face_codes(topology: Topology, half_edges: IntArray | slice = slice(None)) -> IntArray:
+    """Return the code of each half-edge's face and edge: the size of the face, the sharpness of the edge."""
+    t, face = topology, topology.face[half_edges]
+    size = np.broadcast_to(t.common_size, len(face)) if t.common_size else t.face_sizes[face]
     if t.semi_sharpness is None:
         return size
-    return row_codes([size, *map(_value_codes, t.edge_sharpness.T)]).astype(np.int64)
+    return row_codes([size, *map(_value_codes, t.edge_sharpness[half_edges].T)]).astype(np.int64)
 
 
 def _faces_clockwise(topology: Topology) -> IntArray:
@@ -280,8 +275,7 @@ def _codes_around(
     topology: Topology,
     face_codes: IntArray,  # (n_h,) int: code of each half-edge's face
     face_count: IntArray,  # (n_h,) int: number of faces of the fan around the half-edge's vertex
-    # ((m,) int, (m,) int): half-edges whose fans are cut to `NEAR_FACES`, and how many of these faces lie clockwise of
-    # the half-edge's face
+    # ((m,) int, (m,) int): half-edges whose fans are cut to `NEAR_FACES`, and the number of near faces clockwise
     cut: tuple[IntArray, IntArray] | None,
 ) -> tuple[IntArray, IntArray]:
     """Two columns that encode the sequence of faces around the vertex of each half-edge.

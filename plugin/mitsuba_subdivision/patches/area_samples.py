@@ -13,8 +13,7 @@ from ..mesh.connectivity import IntArray
 from ..schemes.domain import FloatArray
 from .polynomial_pieces import PolynomialPieces, SurfacePieces, Tips
 
-# Tolerance of the area of the surface, divided evenly among the pieces; and rounding error of a piece's area. Both are
-# relative.
+# Relative tolerance of the surface's area, divided evenly among the pieces; relative rounding error of a piece's area.
 TOLERANCE, ROUNDED = 1e-12, 1e-14
 # Pairs of numbers of Gauss nodes along each parameter. The difference of the two areas is the error estimate. A piece
 # for which no pair is accurate is halved, at most MOST_HALVINGS times: along a fold, where area elements have a kink,

@@ -28,8 +28,7 @@ MOST_KEPT = 200_000
 MOST_CONVEX_HALVINGS = 3
 # A location is a minimum where the distance falls no faster than this along the surface, see `slopes`.
 FLAT_SLOPE = 1e-10
-# Size, relative to the patch, down to which levels around an extraordinary point are searched. The point itself stands
-# for the smaller ones.
+# Relative size down to which levels around an extraordinary point are searched. The point stands for smaller ones.
 SMALLEST = 2.0**-44
 # Points per run of a query, which bounds temporary memory to some hundred megabytes.
 CHUNK = 1 << 17

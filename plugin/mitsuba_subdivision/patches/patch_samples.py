@@ -57,8 +57,7 @@ class PatchSampler:
 
     def evaluate(
         self,
-        # (s,) int64: the corner of an element where a sample's parameters are (0, 0), a half-edge of
-        # `PatchTable.elements`
+        # (s,) int64: the corner where a sample's parameters are (0, 0), a half-edge of `PatchTable.elements`
         half_edge: IntArray,
         uv: FloatArray,  # (s, 2) float64: parameters, starting at that corner
         # As for `LimitSurface.evaluate`

@@ -241,8 +241,6 @@ class PatchTable:
         t, of_mesh = self.elements, fan_codes(self.topology, near=self.scheme.has_local_borders)
         fans = of_mesh if t is self.topology else of_mesh[self.half_edge_of_corner]
         begins, whole_codes = self._turned_to_least(fans, t.face_offsets[:-1][self.is_whole])
-        if self.is_whole.all():
-            return begins, whole_codes, of_mesh
         corners: list[IntArray] = [begins]
         codes = [whole_codes]
         sizes = np.where(self.is_whole, 0, t.face_sizes)

@@ -47,8 +47,7 @@ FRAMES, LEVEL, LEVELS, TERM = 3, 4, 1023, 4096
 # Where the normals of a tip need a frame in place of the derivatives: nowhere, at the extraordinary point, or at all
 # deeper levels (`uneven_frame`).
 NO_FRAME, AT_POINT, UNEVEN = range(3)
-# Blocks of `Tip.rows` after those of the regular children of a level: the rest, and the frame at the point; then come
-# the factors.
+# Blocks of `Tip.rows` after those of the regular children of a level: the rest, the frame at the point, the factors.
 REST, FRAME, FACTORS = LEVEL_PIECES, LEVEL_PIECES + 1, LEVEL_PIECES + 2
 # Most bytes of coefficients, in single precision, of the levels of tips that are stored as pieces.
 COEFFICIENT_BYTES = 1 << 26

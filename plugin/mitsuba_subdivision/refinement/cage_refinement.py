@@ -201,8 +201,7 @@ class RefinedCorners:
     cage: ControlCage
     refined: Topology  # The refined cut mesh
     kind: IntArray  # (n_c,) int: whether the parent of each refined corner is a VERTEX, an EDGE or a FACE
-    # (n_c,) int: a half-edge of the cage that begins at the parent vertex, is along the parent edge or in the parent
-    # face
+    # (n_c,) int: a half-edge of the cage that begins at the parent vertex, or is along the parent edge or face
     half_edge: IntArray
 
     @classmethod

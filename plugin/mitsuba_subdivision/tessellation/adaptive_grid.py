@@ -41,8 +41,7 @@ class PatchFrames:
     # way along its edges, and to the element's centre.
     is_whole: NDArray[np.bool_]
     scale: FloatArray  # (n_f,) float64: factor from a patch's parameters to its element's, starting at the same corner
-    # (n_h,) int32: numbers of the edge of each half-edge and of the vertex at which it begins, equal on both sides of a
-    # crease
+    # (n_h,) int32: numbers of each half-edge's edge and first vertex, equal on both sides of a crease
     edge: IndexArray
     vertex: IndexArray
     # (n_h,) bool: whether positions along the edge of a half-edge are counted from the half-edge's end
@@ -78,8 +77,7 @@ def tile_type(corner_count: int) -> np.dtype[np.void]:
             ("depth", np.int32),
             # Least u and v of the tile in its patch's domain, in units of ``2^-depth``
             ("origin", np.int32, 2),
-            # Whether the tile's parameters run backwards, as in the middle child of a triangle. Its corner (0, 0) is
-            # then at ``origin + 1``.
+            # Whether parameters run backwards, as in a triangle's middle child, with (0, 0) at ``origin + 1``
             ("is_flipped", np.bool_),
             # Halvings from an edge of the patch to a side of the tile; around extraordinary points, from an edge of a
             # ring

@@ -21,8 +21,7 @@ from ..schemes.domain import FloatArray
 # circumcircle is that of the box, whose squared radius is a quarter of the squared diagonal [Waldron 1998].
 SQUARE_ERROR = 1 / 8
 # The same on triangular grids, relative to the sides of their triangles: half the largest squared radius of the
-# smallest circle around a triangle of a strip between two rates. It occurs at a corner where the segments of both sides
-# are half as long.
+# smallest circle around a triangle of a strip between two rates, at a corner where both sides' segments are halved.
 TRIANGLE_ERROR = 0.227
 # Factor of the error for triangles that an outline's sensor cannot see edge-on. Their error is visible where surfaces
 # intersect, and in shadows: at 6.4 pixels, a teapot's handle ended in a different place.

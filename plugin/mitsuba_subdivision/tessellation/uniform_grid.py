@@ -48,8 +48,7 @@ class UniformGrid:
     def __init__(
         self,
         domain: ParameterDomain,
-        # Of the elements: each face with corners is an element, and a half-edge represents the corner at which it
-        # begins
+        # Of the elements: each face with corners is an element, each half-edge the corner at which it begins
         topology: Topology,
         rate: int,  # Segments on every edge
     ) -> None:

@@ -195,8 +195,7 @@ def vertex_polynomials(
     scheme: Scheme, classes: Sequence[PatchClass], uv: Sequence[FloatArray], runs: VertexRuns
 ) -> tuple[VertexPolynomials, ...]:
     """Find the polynomials on which vertices lie: planes, and the scheme's, from the samples ``(s, 2)`` of classes."""
-    # Without unused classes: at low rates, patches of other classes may evaluate all samples of a class. Sorted by the
-    # size of one-rings.
+    # Without unused classes: at low rates, others may evaluate all samples of a class. Sorted by sizes of one-rings.
     used = np.unique(runs.patch_class).tolist()
     used.sort(key=lambda index: classes[index].control_count)
     used_index = np.empty(len(classes), dtype=np.int64)
