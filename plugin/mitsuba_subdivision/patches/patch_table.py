@@ -223,8 +223,7 @@ class PatchTable:
         t = self.elements
         dtypes = np.min_scalar_type(-self.class_count), np.int32, np.int8
         class_index, patch, patch_corner = (np.full(t.half_edge_count, -1, dtype=dtype) for dtype in dtypes)
-        corners: IntArray = self._patch_codes[0][self._order[0]].astype(np.intp)
-        counts = self.patch_counts
+        corners, counts = self._patch_codes[0][self._order[0]], self.patch_counts
         in_class, index = np.repeat(np.arange(len(counts)), counts), ragged.index_in_row(counts)
         class_index[corners], patch[corners], patch_corner[corners] = in_class, index, 0
         if self.is_whole.any():
