@@ -245,11 +245,11 @@ def linear_values(pixels: NDArray, is_srgb: bool, channels: Sequence[int] = (0, 
 def _halved(pixels: NDArray, count: int, is_srgb: bool) -> NDArray:
     colors = 3 if is_srgb else 0
     if pixels.dtype == np.uint8:
-        values = np.concatenate([_LINEAR[pixels[..., :colors]], pixels[..., colors:] * np.uint16(257)], axis=2)
+        values = np.concatenate([_LINEAR.take(pixels[..., :colors]), pixels[..., colors:] * np.uint16(257)], axis=2)
         for _ in range(count):
             values = _half(values)
         rest = ((values[..., colors:].astype(np.uint32) + 128) // 257).astype(np.uint8)
-        return np.concatenate([_ENCODED[values[..., :colors]], rest], axis=2)
+        return np.concatenate([_ENCODED.take(values[..., :colors]), rest], axis=2)
     values = linear_values(pixels, is_srgb)
     for _ in range(count):
         values = _half(values)

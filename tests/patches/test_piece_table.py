@@ -47,14 +47,15 @@ def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkey
     cage = tagged(mixed_torus(), creases=[(0, 8, INFINITE), (8, 16, INFINITE)])
     surface = LimitSurface(bumpy(cage))
     table, (refined, matrix) = surface.pieces(), surface.patches.refined
+    controls, refinement = table.control_rows
     assert surface.patches.topology.vertex_count > cage.vertex_count
-    assert table.refinement.shape == (refined.topology.vertex_count, cage.vertex_count)
-    np.testing.assert_allclose(table.refinement.sum(axis=1), 1, rtol=0, atol=ROUNDING)
+    assert refinement.shape == (refined.topology.vertex_count, cage.vertex_count)
+    np.testing.assert_allclose(refinement.sum(axis=1), 1, rtol=0, atol=ROUNDING)
     positions = surface.cage.positions
     expected = matrix @ positions[surface.cage.cut_mesh.vertex]
-    np.testing.assert_allclose(table.refinement @ positions, expected, rtol=0, atol=ROUNDING)
-    np.testing.assert_array_equal(table.controls, refined.controls)
-    assert surface.sampling(1).refinement is table.refinement
+    np.testing.assert_allclose(refinement @ positions, expected, rtol=0, atol=ROUNDING)
+    np.testing.assert_array_equal(controls, refined.controls)
+    assert surface.sampling(1).refinement is refinement
     # The patch at a half-edge is the refined face there.
     corners = np.concatenate([group.corners for group in refined.classes])
     for half_edge, code in enumerate(table.half_edges[:, layout.CODE]):
@@ -74,4 +75,4 @@ def test_parts_of_equal_division_share_pieces():
 
 def test_tables_without_creases_use_the_patches_control_points():
     surface = LimitSurface(extraordinary(5))
-    assert np.shares_memory(surface.pieces().controls, surface.patches.controls)
+    assert np.shares_memory(surface.pieces().control_rows[0], surface.patches.controls)

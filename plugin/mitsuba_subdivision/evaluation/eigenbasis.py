@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +25,8 @@ INVERSE_ITERATIONS = 25  # Number of steps of inverse iteration; each divides th
 # The modulus of the second eigenvalue must be below one by more than this, or refinement does not converge.
 CONTRACTION = 1e-9
 POWER = 20  # Power of the matrix with which `_require_basis` checks a basis
+LARGE = 64  # Number of rows of the largest matrix for which OpenBLAS starts no threads
+_one_thread = Lock()
 
 
 class EigenbasisError(ArithmeticError):
@@ -83,6 +90,22 @@ class Eigenbasis:
             (block_slice, sign[block_slice, None] * block * sign[block_slice]) for block_slice, block in self.blocks
         )
         return Eigenbasis(self.vectors * sign, self.inverse * sign[:, None], self.eigenvalues, self.moduli, blocks)
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Let OpenBLAS compute in one thread. Its threads wait for each other in loops, ten times as long as they compute.
+
+    Other libraries, and those of Windows, stay as they are.
+    """
+    library = ctypes.CDLL(str(import_module("numpy.linalg._umath_linalg").__file__))
+    set_threads = getattr(library, "openblas_set_num_threads_local", lambda count: count)
+    with _one_thread:
+        before = set_threads(1)
+        try:
+            yield
+        finally:
+            set_threads(before)
 
 
 def eigenbasis(
@@ -170,6 +193,8 @@ def _subspace(
 ) -> FloatArray:
     """Return an orthonormal basis of a cluster's invariant subspace, by block inverse iteration if need be."""
     vectors, count = eigenvectors[:, members], len(members)
+    if count == 1:
+        return vectors.real
     left, singular, _ = np.linalg.svd(np.hstack([vectors.real, vectors.imag]), full_matrices=False)
     block: FloatArray = left[:, :count]
     if singular[count - 1] >= DEPENDENT:

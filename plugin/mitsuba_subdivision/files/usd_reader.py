@@ -399,19 +399,22 @@ def _with_shared_values(
     """
     if len(values) != len(vertices) or sizes.sum() != len(vertices) or not sizes.all():
         return values, None
-    keys = [vertices, *(values + 0.0).T]
+    keys = [*(values + 0.0).T]
     if values.shape[1] == 2:
         starts = np.cumsum(sizes) - sizes
         after = np.arange(1, len(vertices) + 1)
         after[starts + sizes - 1] = starts
         (u, v), (next_u, next_v) = values.T, values[after].T
         keys.append(np.repeat(np.add.reduceat(u * next_v - v * next_u, starts) > 0, sizes))
-    order = np.lexsort(keys)
-    is_first = np.ones(len(order), dtype=bool)
-    is_first[1:] = np.any([key[order[1:]] != key[order[:-1]] for key in keys], axis=0)
-    indices = np.empty(len(order), dtype=np.int64)
-    indices[order] = np.cumsum(is_first) - 1
-    return values[order[is_first]], indices
+    # Most corners have the values of the first corner at their vertex; only the others are sorted.
+    source = ragged.first_indices(vertices, int(vertices.max()) + 1)[vertices]
+    rest = np.flatnonzero(np.any([key != key[source] for key in keys], axis=0))
+    sorted_keys = [vertices[rest], *(key[rest] for key in keys)]
+    rest = rest[order := np.lexsort(sorted_keys)]
+    is_first = np.any([np.diff(key[order], prepend=np.nan) != 0 for key in sorted_keys], axis=0)
+    source[rest] = rest[is_first][np.cumsum(is_first) - 1]
+    is_row = np.bincount(source, minlength=len(source)) > 0
+    return values[is_row], (np.cumsum(is_row) - 1)[source]
 
 
 def reversed_order(sizes: IntArray) -> IntArray:

@@ -246,7 +246,7 @@ class CoefficientMap:
 
     def __init__(self, table: PieceTable, float_type: type) -> None:
         self._types = types = ArrayTypes(float_type)
-        refinement, controls = table.refinement, table.controls
+        controls, refinement = table.control_rows
         self._piece_count, self._width = table.piece_count, len(polynomial_basis(table.patches.scheme).powers)
         # To the control points of the patches, if these are those of the cage refined once
         self._refinement = None if refinement is None else SparseMatrix.shared(refinement, float_type)

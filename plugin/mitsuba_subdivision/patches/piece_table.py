@@ -110,8 +110,6 @@ class PieceTable:
     tips: tuple[Tip, ...]  # Different ones of all classes
     classes: NDArray[np.void]  # (c,) of type `CLASS`
     control_of_vertex: IntArray  # (n_v,) int64: 0-based control value at each mesh vertex
-    # (n, control_count) matrix from control values to refined ones, if patches are those of the cage refined once
-    refinement: sparse.csr_array | None
 
     @classmethod
     def build(
@@ -166,13 +164,12 @@ class PieceTable:
             tips,
             np.array([*zip(*columns, strict=True)], dtype=CLASS),
             control_of_vertex.array,
-            patches.control_rows(control_of_vertex.array, control_count)[1],
         )
 
     @property
-    def controls(self) -> NDArray[np.uint32]:
-        """``(n,)`` `PatchTable.controls` as indices of control values; of refined ones if there is a `refinement`."""
-        return self.patches.control_rows(self.control_of_vertex, self.control_count)[0]
+    def control_rows(self) -> tuple[NDArray[np.uint32], sparse.csr_array | None]:
+        """`PatchTable.control_rows` of the control values."""
+        return self.patches.control_rows(self.control_of_vertex, self.control_count)
 
     @property
     def trees(self) -> list[TreeArrays]:

@@ -221,16 +221,11 @@ def channels_at_hits(surface: LimitSurface, float_type: type) -> dict[str, Chann
     from ..kernels.channel_kernel import ChannelKernel
 
     channels = {name: surface.channel(name) for name in surface.attribute_names}
-    kernels = {
+    return {
         name: ChannelKernel(channel, float_type)
         for name, channel in channels.items()
         if name == TEXCOORDS or channel.values.shape[1] in WIDTHS
     }
-    for layout in {channel.layout for channel in channels.values()}:
-        # Values with seams have a mesh of their own.
-        if layout.patches is not surface.patches:
-            layout.patches.forget()
-    return kernels
 
 
 def spectral_upsampling(variant: Variant, sizes: dict[str, int]) -> dict[str, SpectralUpsampling]:

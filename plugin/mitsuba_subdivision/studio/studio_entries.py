@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..cage import ControlCage
 from ..cage.errors import CageSource, in_digits, warn
+from ..evaluation.equations import times_matrix
 from ..mitsuba_mesh import box_corners
 from ..shapes.foreground import FOREGROUND
 from ..variants import SceneNode
@@ -123,7 +124,7 @@ def studio(
             f"{prefix}a model {in_digits(2 * radius)} units large; expected {SIZES[0]:g} to {SIZES[1]:g}, beyond which "
             "Mitsuba's single precision loses light and surfaces"
         )
-    origin, distance = framed(in_world @ axes, azimuth, elevation, size)
+    origin, distance = framed(times_matrix(in_world[None], axes)[0], azimuth, elevation, size)
     right, up_in_picture, forward = (axes @ camera_axes(azimuth, elevation)).T
     from_below = elevation < 0
     scene: SceneNode = {
@@ -200,7 +201,7 @@ def framed(
     Returns its place in the studio's axes, and its distance from the middle of the points, along the view.
     """
     axes = camera_axes(azimuth, elevation)
-    in_camera = points @ axes
+    in_camera = times_matrix(points[None], axes)[0]
     z = in_camera[:, 2]
     nearest, middle = [], []
     for along, slope in zip(in_camera.T[:2], _slopes(size), strict=True):
