@@ -25,8 +25,7 @@ INVERSE_ITERATIONS = 25  # Number of steps of inverse iteration; each divides th
 # The modulus of the second eigenvalue must be below one by more than this, or refinement does not converge.
 CONTRACTION = 1e-9
 POWER = 20  # Power of the matrix with which `_require_basis` checks a basis
-LARGE = 64  # Number of rows of the largest matrix for which OpenBLAS starts no threads
-_one_thread = Lock()
+_one_thread = Lock()  # Held while OpenBLAS has no threads
 
 
 class EigenbasisError(ArithmeticError):
@@ -93,11 +92,8 @@ class Eigenbasis:
 
 
 @contextmanager
-def one_blas_thread() -> Iterator[None]:
-    """Let OpenBLAS compute in one thread. Its threads wait for each other in loops, ten times as long as they compute.
-
-    Other libraries, and those of Windows, stay as they are.
-    """
+def _one_blas_thread() -> Iterator[None]:
+    """Let OpenBLAS compute in one thread: its threads wait in loops, for ten times as long as matrices here take."""
     library = ctypes.CDLL(str(import_module("numpy.linalg._umath_linalg").__file__))
     set_threads = getattr(library, "openblas_set_num_threads_local", lambda count: count)
     with _one_thread:
@@ -108,6 +104,7 @@ def one_blas_thread() -> Iterator[None]:
             set_threads(before)
 
 
+@_one_blas_thread()
 def eigenbasis(
     matrix: FloatArray,  # (K, K) float64: rows sum to one, 1 is a simple eigenvalue, and all others are smaller
 ) -> Eigenbasis:

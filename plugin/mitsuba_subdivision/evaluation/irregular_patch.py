@@ -5,7 +5,6 @@ Also Bernstein coefficients of the three regular pieces at each level, and a bou
 
 from __future__ import annotations
 
-from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -17,7 +16,7 @@ from ..mesh.signature import Signature
 from ..schemes.domain import FloatArray, ParameterMap
 from ..schemes.scheme import Scheme, SchemeError
 from . import equations
-from .eigenbasis import CLUSTER_WIDTH, LARGE, Eigenbasis, EigenbasisError, eigenbasis, one_blas_thread
+from .eigenbasis import CLUSTER_WIDTH, Eigenbasis, EigenbasisError, eigenbasis
 from .normals import limit_frame, uneven_frame
 from .polynomials import polynomial_basis
 
@@ -49,8 +48,7 @@ class IrregularPatch:
     def basis(self) -> Eigenbasis:
         """Eigenbasis of A, with a positive f of (13). Raises SchemeError if the rules do not contract the one-ring."""
         try:
-            with one_blas_thread() if len(self.matrix) > LARGE else nullcontext():
-                basis = eigenbasis(self.matrix)
+            basis = eigenbasis(self.matrix)
         except EigenbasisError as error:
             ring = f"a {self.signature.kind} with fans {self.signature.fans}"
             raise SchemeError(f"{self.scheme.name}: subdivision matrix of {ring}: {error}") from error

@@ -7,9 +7,7 @@ while a function is recorded, values are neither read back nor checked, and all 
 
 from __future__ import annotations
 
-import ctypes
 import gc
-import sys
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -85,12 +83,6 @@ class DeferredCollection:
     def _on_collection(self, phase: str, _info: dict[str, int]) -> None:
         if phase == "start":
             self._restore()
-
-
-def release_memory() -> None:
-    """Return freed memory to the system: glibc keeps that of temporary arrays, some hundred megabytes."""
-    if sys.platform == "linux":
-        getattr(ctypes.CDLL(None), "malloc_trim", bool)(0)
 
 
 def is_recording() -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+import sys
 from typing import TYPE_CHECKING, Any
 from weakref import WeakMethod
 
@@ -16,15 +18,7 @@ from ..llvm import require_llvm
 from ..surface import TEXCOORDS
 from ..variants import Variant
 from .cage_attributes import PREFIX, CageAttributes, channels_at_hits, mesh_attributes, mesh_name
-from .device_state import (
-    DeviceState,
-    flat_type,
-    is_recording,
-    paused_collection,
-    release_memory,
-    require_values,
-    traversed,
-)
+from .device_state import DeviceState, flat_type, is_recording, paused_collection, require_values, traversed
 from .mesh_buffers import MeshBuffers, Triangles
 from .outlines import seen_edges
 from .parameter_table import errors_about, plugin_page
@@ -140,10 +134,10 @@ def make_subdivision(
             self._mesh.settle()
             for values in [channel.values for channel in channels.values()] + ([on_device.values] if on_device else []):
                 values.settle()
-            # Kernels have their tables; updates compute the rest again.
+            # Kernels have their tables; updates compute the rest again. The memory would stay with glibc.
             meshes = {surface.patches, *(surface.channel(name).layout.patches for name in channels)}
-            if sum(patches.forget() for patches in meshes):
-                release_memory()
+            if sum(patches.forget() for patches in meshes) and sys.platform == "linux":
+                getattr(ctypes.CDLL(None), "malloc_trim", bool)(0)
 
         def _triangles(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> Triangles:
             parameters, surface = self._parameters, self._parameters.surface
