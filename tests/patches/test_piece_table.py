@@ -47,7 +47,7 @@ def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkey
     cage = tagged(mixed_torus(), creases=[(0, 8, INFINITE), (8, 16, INFINITE)])
     surface = LimitSurface(bumpy(cage))
     table, (refined, matrix) = surface.pieces(), surface.patches.refined
-    controls, refinement = table.control_rows
+    controls, refinement = surface.patches.control_rows()
     assert surface.patches.topology.vertex_count > cage.vertex_count
     assert refinement.shape == (refined.topology.vertex_count, cage.vertex_count)
     np.testing.assert_allclose(refinement.sum(axis=1), 1, rtol=0, atol=ROUNDING)
@@ -75,4 +75,4 @@ def test_parts_of_equal_division_share_pieces():
 
 def test_tables_without_creases_use_the_patches_control_points():
     surface = LimitSurface(extraordinary(5))
-    assert np.shares_memory(surface.pieces().control_rows[0], surface.patches.controls)
+    assert np.shares_memory(surface.patches.control_rows()[0], surface.patches.controls)

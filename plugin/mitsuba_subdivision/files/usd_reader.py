@@ -407,7 +407,7 @@ def _with_shared_values(
         (u, v), (next_u, next_v) = values.T, values[after].T
         keys.append(np.repeat(np.add.reduceat(u * next_v - v * next_u, starts) > 0, sizes))
     # Most corners have the values of the first corner at their vertex; only the others are sorted.
-    source = ragged.first_indices(vertices, int(vertices.max()) + 1)[vertices]
+    source = ragged.first_indices(vertices, int(vertices.max(initial=-1)) + 1)[vertices]
     rest = np.flatnonzero(np.any([key != key[source] for key in keys], axis=0))
     sorted_keys = [vertices[rest], *(key[rest] for key in keys)]
     rest = rest[order := np.lexsort(sorted_keys)]

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..evaluation.polynomials import polynomial_basis
 from ..mesh import ragged
 from ..mesh.shared import Content, shared, shared_by_key
-from ..patches.piece_table import PACKET, PieceTable, piece_packets
+from ..patches.piece_table import PACKET, PieceTable, piece_packets, tree_arrays
 from .array_types import (
     NO_CONFLICTS,
     SUMS,
@@ -246,18 +246,16 @@ class CoefficientMap:
 
     def __init__(self, table: PieceTable, float_type: type) -> None:
         self._types = types = ArrayTypes(float_type)
-        controls, refinement = table.control_rows
+        controls, refinement = table.patches.control_rows(table.control_of_vertex, table.control_count)
         self._piece_count, self._width = table.piece_count, len(polynomial_basis(table.patches.scheme).powers)
         # To the control points of the patches, if these are those of the cage refined once
         self._refinement = None if refinement is None else SparseMatrix.shared(refinement, float_type)
         self._refined_count = table.control_count if refinement is None else refinement.shape[0]
         # Parts of patches have control points of their own, stored after all others, and so are their indices.
-        point_count = self._refined_count
-        parts, pieces = [], []
-        for tree, (first, count, control_count, first_piece, piece_count) in zip(
-            table.trees, table.classes.tolist(), strict=True
-        ):
-            for begin, stencils, weights in tree.maps:
+        point_count, parts, pieces = self._refined_count, [], []
+        classes = zip(table.elements, table.classes.tolist(), strict=True)
+        for element, (first, count, control_count, first_piece, piece_count) in classes:
+            for begin, stencils, weights in tree_arrays(element, table.piece_levels).maps:
                 part_first, part_size = first, control_count
                 if stencils is not None:
                     part_first, part_size = len(controls) + point_count - self._refined_count, len(stencils)

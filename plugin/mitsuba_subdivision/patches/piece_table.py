@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +27,6 @@ from ..mesh.shared import Content, shared
 from ..messages import counted
 from ..schemes.domain import FloatArray
 from .patch_table import PatchTable
-
-if TYPE_CHECKING:
-    from scipy import sparse
 
 # Floats that a kernel reads at once.
 PACKET = 4
@@ -165,16 +162,6 @@ class PieceTable:
             np.array([*zip(*columns, strict=True)], dtype=CLASS),
             control_of_vertex.array,
         )
-
-    @property
-    def control_rows(self) -> tuple[NDArray[np.uint32], sparse.csr_array | None]:
-        """`PatchTable.control_rows` of the control values."""
-        return self.patches.control_rows(self.control_of_vertex, self.control_count)
-
-    @property
-    def trees(self) -> list[TreeArrays]:
-        """Arrays of each class, which are large: kernels upload them, and nothing else keeps them."""
-        return [tree_arrays(element, self.piece_levels) for element in self.elements]
 
     @property
     def half_edges(self) -> NDArray[np.uint32]:

@@ -22,7 +22,7 @@ from ..cage.errors import warn
 from ..device_arrays import mapped, upload
 from ..kernels.array_types import Float, FloatBuffer, Index, Value
 from ..mesh.shared import Content, SharedArray, shared
-from ..surface import TEXCOORDS, LimitSurface
+from ..surface import LimitSurface
 from ..variants import Variant
 from .derivatives import BackwardPasses
 from .device_state import flat_type, require_values
@@ -214,18 +214,6 @@ def mesh_attributes(cage: ControlCage) -> dict[str, int]:
         else:
             sizes[name] = size
     return sizes
-
-
-def channels_at_hits(surface: LimitSurface, float_type: type) -> dict[str, ChannelKernel]:
-    """Texture coordinates and attributes that exact shading evaluates at hits, by their names in the cage."""
-    from ..kernels.channel_kernel import ChannelKernel
-
-    channels = {name: surface.channel(name) for name in surface.attribute_names}
-    return {
-        name: ChannelKernel(channel, float_type)
-        for name, channel in channels.items()
-        if name == TEXCOORDS or channel.values.shape[1] in WIDTHS
-    }
 
 
 def spectral_upsampling(variant: Variant, sizes: dict[str, int]) -> dict[str, SpectralUpsampling]:

@@ -57,7 +57,7 @@ class ExactShading:
         shape: mi.Mesh,  # Its current material is used at each hit; not kept alive
         name: str,  # Name of the cage in messages
         kernel: SurfaceKernel,  # The surface in object space, relative to the centre of the placement
-        channels: dict[str, ChannelKernel],  # See `channels_at_hits`
+        channels: dict[str, ChannelKernel],  # Texture coordinates and attributes, by their names in the cage
         placement: Placement,
         triangles: Triangles,
     ) -> None:

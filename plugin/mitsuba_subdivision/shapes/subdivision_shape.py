@@ -17,7 +17,7 @@ from ..kernels.array_types import Float, FloatBuffer, Index, IndexBuffer, Mask, 
 from ..llvm import require_llvm
 from ..surface import TEXCOORDS
 from ..variants import Variant
-from .cage_attributes import PREFIX, CageAttributes, channels_at_hits, mesh_attributes, mesh_name
+from .cage_attributes import PREFIX, WIDTHS, CageAttributes, mesh_attributes, mesh_name
 from .device_state import DeviceState, flat_type, is_recording, paused_collection, require_values, traversed
 from .mesh_buffers import MeshBuffers, Triangles
 from .outlines import seen_edges
@@ -95,7 +95,12 @@ def make_subdivision(
                 on_device.values.load(self._placement.positions)
             channels: dict[str, ChannelKernel] = {}
             if is_exact and surface.attribute_names:
-                channels = channels_at_hits(surface, variant.Float)
+                from ..kernels.channel_kernel import ChannelKernel
+
+                for name in surface.attribute_names:
+                    channel = surface.channel(name)
+                    if name == TEXCOORDS or channel.values.shape[1] in WIDTHS:
+                        channels[name] = ChannelKernel(channel, variant.Float)
             self._displacement: ShapeDisplacement | None = None
             if parameters.displacement is not None:
                 from .displacement import ShapeDisplacement
