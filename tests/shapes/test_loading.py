@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import Attribute, CageWarning, ControlCage
+from mitsuba_subdivision import Attribute, CageWarning, ControlCage, LimitSurface
 from mitsuba_subdivision.files.formats import FORMATS
 from mitsuba_subdivision.shapes import registration, subdivision_shape
 from mitsuba_subdivision.shapes.device_state import paused_collection
@@ -49,6 +49,16 @@ def placed(shape, i):
 def loaded_together(shapes, **options):
     named = {f"s{i:04}": placed(shape, i) for i, shape in enumerate(shapes)}
     return mi.load_dict({"type": "scene", **named}, **options).shapes()
+
+
+@exact
+@llvm
+def test_loaded_shapes_keep_no_tables_of_their_patches():
+    surface = LimitSurface(coloured(cube()))
+    shape = load(surface.cage, shading="exact")
+    for patches in (surface.patches, surface.channel("texcoords").layout.patches):
+        assert not {"classes", "rings", "refined"} & set(vars(patches))
+    assert shape.is_mesh()
 
 
 WAITING = [
