@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import sys
 from typing import TYPE_CHECKING, Any
 from weakref import WeakMethod
 
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
 # Parameters that move the shape's vertices, and the buffers computed from them.
 _MOVING = {"control_points", "to_world", "displacement", "displacement_scale"}
 _MOVED = ["vertex_positions", "vertex_normals"]
+_LARGE = 1 << 14  # Number of faces of cages whose tables take more memory than it takes time to return
 
 
 def make_subdivision(
@@ -141,8 +141,8 @@ def make_subdivision(
                 values.settle()
             # Kernels have their tables; updates compute the rest again. The memory would stay with glibc.
             meshes = {surface.patches, *(surface.channel(name).layout.patches for name in channels)}
-            if sum(patches.forget() for patches in meshes) and sys.platform == "linux":
-                getattr(ctypes.CDLL(None), "malloc_trim", bool)(0)
+            if sum(patches.forget() for patches in meshes) and surface.cage.face_count > _LARGE:
+                getattr(ctypes.pythonapi, "malloc_trim", bool)(0)
 
         def _triangles(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> Triangles:
             parameters, surface = self._parameters, self._parameters.surface
