@@ -2,12 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib import import_module
-from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +20,6 @@ INVERSE_ITERATIONS = 25  # Number of steps of inverse iteration; each divides th
 # The modulus of the second eigenvalue must be below one by more than this, or refinement does not converge.
 CONTRACTION = 1e-9
 POWER = 20  # Power of the matrix with which `_require_basis` checks a basis
-_one_thread = Lock()  # Held while OpenBLAS has no threads
 
 
 class EigenbasisError(ArithmeticError):
@@ -91,20 +85,6 @@ class Eigenbasis:
         return Eigenbasis(self.vectors * sign, self.inverse * sign[:, None], self.eigenvalues, self.moduli, blocks)
 
 
-@contextmanager
-def _one_blas_thread() -> Iterator[None]:
-    """Let OpenBLAS compute in one thread: its threads wait in loops, for ten times as long as matrices here take."""
-    library = ctypes.CDLL(str(import_module("numpy.linalg._umath_linalg").__file__))
-    set_threads = getattr(library, "openblas_set_num_threads_local", lambda count: count)
-    with _one_thread:
-        before = set_threads(1)
-        try:
-            yield
-        finally:
-            set_threads(before)
-
-
-@_one_blas_thread()
 def eigenbasis(
     matrix: FloatArray,  # (K, K) float64: rows sum to one, 1 is a simple eigenvalue, and all others are smaller
 ) -> Eigenbasis:

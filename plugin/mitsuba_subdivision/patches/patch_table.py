@@ -120,15 +120,11 @@ class PatchTable:
         half_edges = self.half_edge_of_corner[self._patch_codes[0][self._order[0]]]
         return RingTable(self.topology, one_rings(self._signatures), half_edges, self.patch_counts)
 
-    def forget(self) -> bool:
-        """Drop data that are computed again on demand, and return whether there were any."""
-        known = [
-            vars(part).pop(name, None)
-            for part in (self, self.topology, self.elements)
-            for name, value in vars(type(part)).items()
-            if isinstance(value, cached_property)
-        ]
-        return any(value is not None for value in known)
+    def forget(self) -> None:
+        """Drop data that are computed again on demand, for a mesh that only its kernels evaluate."""
+        for part in (self, self.topology, self.elements):
+            for name in [name for name, value in vars(type(part)).items() if isinstance(value, cached_property)]:
+                vars(part).pop(name, None)
 
     @property
     def patch_count(self) -> int:

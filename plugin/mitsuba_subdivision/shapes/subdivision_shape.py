@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from typing import TYPE_CHECKING, Any
 from weakref import WeakMethod
 
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
 # Parameters that move the shape's vertices, and the buffers computed from them.
 _MOVING = {"control_points", "to_world", "displacement", "displacement_scale"}
 _MOVED = ["vertex_positions", "vertex_normals"]
-_LARGE = 1 << 14  # Number of faces of cages whose tables take more memory than it takes time to return
 
 
 def make_subdivision(
@@ -139,10 +137,9 @@ def make_subdivision(
             self._mesh.settle()
             for values in [channel.values for channel in channels.values()] + ([on_device.values] if on_device else []):
                 values.settle()
-            # Kernels have their tables; updates compute the rest again. The memory would stay with glibc.
-            meshes = {surface.patches, *(surface.channel(name).layout.patches for name in channels)}
-            if sum(patches.forget() for patches in meshes) and surface.cage.face_count > _LARGE:
-                getattr(ctypes.pythonapi, "malloc_trim", bool)(0)
+            # Kernels have their tables; updates compute the rest again.
+            for patches in {surface.patches, *(surface.channel(name).layout.patches for name in channels)}:
+                patches.forget()
 
         def _triangles(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> Triangles:
             parameters, surface = self._parameters, self._parameters.surface
