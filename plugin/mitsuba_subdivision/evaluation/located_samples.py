@@ -172,11 +172,8 @@ class LocatedSamples:
                     child_rows = below[child][begins[child] - len(at) : begins[child]]
                     product = times_matrix(
                         child_rows.reshape(1, -1, child_rows.shape[2]), tree.children[child_number][1]
-                    ).reshape(len(at), size, -1)
-                    if len(at) == count:
-                        node_weights = product
-                    else:
-                        node_weights[at] = product
+                    )
+                    node_weights[at] = product.reshape(len(at), size, -1)
                 current.append(node_weights)
             below = current
         return below

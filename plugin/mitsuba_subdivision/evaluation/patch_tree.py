@@ -53,13 +53,13 @@ class PatchTree:
     def __init__(self, scheme: Scheme, signature: Signature) -> None:
         self.scheme, self.signature = scheme, signature
         self.control_count = one_ring(signature).vertex_count  # K, of the element's one-ring
-        # Of elements that are refined: children, maps from the element's parameters to theirs, and their stencils
+        # Once the element is refined: children with their stencils, and maps from its parameters to theirs
         self.refined: list[tuple[PatchTree, FloatArray]] = []
         self.domains: tuple[ParameterMap, ...] = ()
 
     @cached_property
     def tip_corners(self) -> list[int]:
-        """The corners at which the element may be self-similar: all others are regular. None for regular elements."""
+        """Corners at which the element may be self-similar, as all others are regular; empty for regular elements."""
         scheme, signature = self.scheme, self.signature
         # Each refinement reduces the sharpness, so semi-sharp elements are not self-similar.
         if signature.is_semi_sharp or lattice_stencils(scheme, signature) is not None:

@@ -190,10 +190,10 @@ class Piece:
             return [dr.gather(types.float, self.buffer, offset + i, active) for i in range(size, 2 * size)]
 
         def add_term(k, *totals):
-            factor = dr.gather(types.float, kernel._weights, tip.factor + k)
+            factor = kernel.factor(tip.factor + k)
             weights = [weight * factor for weight in evaluate(kernel.weights(tip.row + k), s, t, derivatives)]
             if has_frame:
-                factor = dr.gather(types.float, kernel._weights, tip.frame_factor + k, tip.needs_frame)
+                factor = kernel.factor(tip.frame_factor + k, tip.needs_frame)
                 tangents = evaluate(kernel.weights(tip.frame_row + k, tip.needs_frame), s, t)[1:]
                 weights += [tangent * factor for tangent in tangents]
             products = itertools.product(weights, coordinate(k - 1))
@@ -328,6 +328,10 @@ class PieceKernel:
     def weights(self, row: Index, active: Mask = True) -> list:
         """Fetch a row of the blocks, with one weight for each monomial."""
         return self.types.row(self._weights, self._row_size, row, active)[: self.count]
+
+    def factor(self, index: Index, active: Mask = True) -> Float:
+        """Fetch the factor of a term."""
+        return dr.gather(self.types.float, self._weights, index, active)
 
     def _split(
         self, half_edge: Index, row: Index4, u: Float, v: Float, active: Mask

@@ -97,10 +97,12 @@ class Signature:
     fans: tuple[Fan, ...]
 
     def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
         # Kept, as signatures are keys of many caches, and fans take long to hash.
-        if "hash" not in vars(self):
-            vars(self)["hash"] = hash(self.fans)
-        return vars(self)["hash"]
+        return hash(self.fans)
 
     @property
     def sharpness(self) -> float:
