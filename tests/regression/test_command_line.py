@@ -83,6 +83,8 @@ def test_any_two_images(folder):
         (["reference.exr", "missing.exr"], "is not a file"),
         (["missing.exr", SCENE], "missing.exr --reference"),
         (["reference.exr", "plain.exr", "--seed", "0"], "--seed is for a scene"),
+        (["reference.exr", "plain.exr", "--tiers", "probe"], 'tier "probe" cannot run'),
+        (["reference.exr", "plain.exr", "--tolerance", "x=1"], 'unknown tolerance "x"'),
         (["plain.exr", SCENE], "does not say how it was rendered"),
         (["reference.exr", "/missing.xml"], "is not a file"),
         (["reference.exr", "plain.exr", "--spp", "1"], "--spp is for a scene"),

@@ -196,6 +196,7 @@ def test_undecided_comparisons_are_in_warnings_summary_and_junit(with_reference,
     told = "*paired: same samples, but *processor another here*the tile tier decides instead*"
     result.stdout.fnmatch_lines(["*warnings summary*", told, "*render differences: not decided*", told])
     assert "processor another here" in (with_reference.path / "junit.xml").read_text()
+    # A change is a failure in spite of that.
     with_reference.makefile(".xml", ball=SCENE.replace('"0.5"', '"0.505"'))
     failing(with_reference).stdout.fnmatch_lines(["*tile *fail*", "*compared all samples of the reference*"])
 
@@ -285,6 +286,8 @@ def test_scenes_of_any_kind_and_wrong_ones(project):
         @pytest.mark.parametrize(("given", "message"), [
             ({"name": None}, "has no name"),
             ({"name": "../x"}, "letters, digits"),
+            ({"tiers": ["pixels"]}, "unknown tier"),
+            ({"tolerances": {"x": 1}}, "unknown tolerance"),
             ({"variant": "scalar_x"}, "unknown variant"),
         ])
         def test_wrong(check, given, message):
@@ -292,8 +295,8 @@ def test_scenes_of_any_kind_and_wrong_ones(project):
                 check(scene(0.5), **given)
         """
     )
-    project.runpytest("--render-update-all", "-k", "test_dictionary").assert_outcomes(passed=1, deselected=4)
-    project.runpytest("-W", "error", "--render-report=none").assert_outcomes(passed=5)
+    project.runpytest("--render-update-all", "-k", "test_dictionary").assert_outcomes(passed=1, deselected=6)
+    project.runpytest("-W", "error", "--render-report=none").assert_outcomes(passed=7)
 
 
 def test_a_project_without_renders_imports_nothing_for_it(pytester):

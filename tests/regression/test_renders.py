@@ -9,6 +9,7 @@ import pytest
 from mitsuba_subdivision import variants
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.commands import pictures
+from mitsuba_subdivision.commands.cluster import render_on_cluster
 from mitsuba_subdivision.regression import RegressionError, renders
 from mitsuba_subdivision.regression import scene as scenes
 from mitsuba_subdivision.regression.compare import Comparison
@@ -331,3 +332,9 @@ def test_a_cluster_gives_the_bits_of_one_machine_if_a_worker_dies(tmp_path, monk
         assert all(np.array_equal(together[name], alone[name]) for name in alone)
     assert not np.array_equal(made[0][0]["R"], made[0][2]["R"])
     assert load_image("together_0005.exr").probe is not None
+
+
+def test_a_missing_cluster_is_an_error():
+    pytest.importorskip("distributed")
+    with pytest.raises(RegressionError, match="no Dask scheduler"):
+        render_on_cluster("nonsense://", load_scene, None, 0)
