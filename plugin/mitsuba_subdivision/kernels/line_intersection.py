@@ -153,7 +153,7 @@ def line_hits(
     no, zero = types.float(0) > 1, types.float(0)
     given = location.half_edge, location.u, location.v
     start = _Search(types.index(ON_LINE), no, types.index(0), zero, no, *given, d, (d * 0,) * 4)
-    end = _repeated(next_round, start, lambda state: active & ~state.is_done, "line_intersection")
+    end = _repeated(next_round, start, lambda _aim, is_done, *_: active & ~is_done, "line_intersection")
     from_first, corner = walk.from_first(Location(end.half_edge, end.u, end.v), active)
     return from_first, end.aim, PatchValues(*end.surface).seen_from_first(walk, corner)
 
@@ -196,11 +196,11 @@ def piece_hits(
 
     zero = types.float(0)
     start = _Newton(types.index(steps + 1), zero, zero, zero, zero > 1, d, (d * 0,) * 4)
-    return _repeated(next_step, start, lambda state: state.steps_left > 0, "newton")
+    return _repeated(next_step, start, lambda steps_left, *_: steps_left > 0, "newton")
 
 
-def _repeated(step: Callable[[Any], Any], start: Any, is_active: Callable[[Any], Mask], label: str) -> Any:
-    """Repeat a step from a state while a condition holds: a loop over the numbers in the state.
+def _repeated(step: Callable[[Any], Any], start: Any, is_active: Callable[..., Mask], label: str) -> Any:
+    """Repeat a step from a state while a condition of its numbers holds: a loop over the numbers in the state.
 
     Dr.Jit takes three times as long to find them in objects. The state ends with a vector, and a tuple of vectors.
     """
@@ -213,5 +213,7 @@ def _repeated(step: Callable[[Any], Any], start: Any, is_active: Callable[[Any],
         d, *surface = (vector(*numbers[i : i + 3]) for i in range(count, len(numbers), 3))
         return make(*numbers[:count], d, surface)
 
-    functions = (lambda *values: is_active(state(values))), (lambda *values: numbers(step(state(values))))
-    return state(dr.while_loop(numbers(start), *functions, mode="symbolic", label=label))
+    def next_numbers(*values: Any) -> tuple:
+        return numbers(step(state(values)))
+
+    return state(dr.while_loop(numbers(start), is_active, next_numbers, mode="symbolic", label=label))

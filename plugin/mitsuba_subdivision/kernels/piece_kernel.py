@@ -279,10 +279,11 @@ class PieceKernel:
             code, u, v, scale, quarter = self._split(half_edge, row, u, v, active)
         turn = code // PATCH_CORNER & CORNERS
         patch = code // PATCH
-        first_piece, node = dr.gather(types.index2, self._patch_starts, patch, active)
+        first_piece, root = dr.gather(types.index2, self._patch_starts, patch, active)
+        node = dr.gather(types.index4, self._nodes, root, active)
         if self._is_divided:
             node, turn, u, v, scale = self._leaf(node, turn, u, v, scale, active)
-        kind, number, block_row, tip_code = dr.gather(types.index4, self._nodes, node, active)
+        kind, number, block_row, tip_code = node
         turn = (turn + kind // TURN) % domain.corner_count
         u, v = turned(domain, u, v, turn)
         number, is_piece, tip = first_piece + number, active, None
@@ -360,28 +361,25 @@ class PieceKernel:
         return self.types.index(number), *inner
 
     def _leaf(
-        self, node: Index, turn: Index, u: Float, v: Float, scale: Float, active: Mask
-    ) -> tuple[Index, Index, Float, Float, Float]:
+        self, node: Index4, turn: Index, u: Float, v: Float, scale: Float, active: Mask
+    ) -> tuple[Index4, Index, Float, Float, Float]:
         """Descend to the leaf that contains given parameters.
 
-        Returns the leaf; the corner of its domain from which parameters are seen; parameters in the leaf; and their
-        derivative by the given parameters. Parameters stay relative to the corner from which they were given, which is
-        the same corner of each child's domain: turning them would cancel digits next to this corner.
+        Returns the leaf's row; the corner of its domain from which parameters are seen; parameters in the leaf; and
+        their derivative by the given parameters. Parameters stay relative to the corner from which they were given,
+        which is the same corner of each child's domain: turning them would cancel digits next to this corner.
         """
         types, count = self.types, self.domain.corner_count
 
-        def node_at(node):
-            return dr.gather(types.index4, self._nodes, node, active)
-
         def descend(node, turn, u, v, scale):
-            kind, first, _, _ = node_at(node)
+            kind, first, _, _ = node
             turn = (turn + kind // TURN) % count
             number, inner_u, inner_v, inner_scale = self._child_at(u, v)
             # Children at corners are numbered from the first corner; the middle child of a triangle is the last.
             number = dr.select(number < count, (number + turn) % count, number)
             is_only = (kind & KINDS) == _ONLY_CHILD
             return (
-                first + dr.select(is_only, 0, number),
+                dr.gather(types.index4, self._nodes, first + dr.select(is_only, 0, number), active),
                 turn,
                 dr.select(is_only, u, inner_u),
                 dr.select(is_only, v, inner_v),
@@ -390,7 +388,7 @@ class PieceKernel:
 
         return dr.while_loop(
             (node, turn, u, v, scale),
-            lambda node, *_: active & ((node_at(node)[0] & KINDS) < _REGULAR),
+            lambda node, *_: active & ((node[0] & KINDS) < _REGULAR),
             descend,
             mode="symbolic",
             label="tree_arrays",
