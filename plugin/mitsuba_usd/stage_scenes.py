@@ -125,10 +125,8 @@ class StageScenes(studio.SceneSource[SceneContents]):
         if opens >= closes:
             times = f"shutter:open is {in_digits(opens)}, and shutter:close {in_digits(closes)}"
             problem = times if first.camera else "there is no camera"
-            raise CageError(
-                f"{self.name}: {problem}; expected a camera whose shutter opens before it closes, and render settings "
-                "without disableMotionBlur, or an interval, such as --shutter -0.25:0.25"
-            )
+            camera = "a camera whose shutter opens before it closes, and render settings without disableMotionBlur"
+            raise CageError(f"{self.name}: {problem}; expected {camera}, or an interval, such as --shutter -0.25:0.25")
         return [opens + (closes - opens) * (part + 0.5) / self._shutter for part in range(self._shutter)]
 
     def framing(self, contents: SceneContents) -> tuple[str, studio.View, tuple[int, int]]:

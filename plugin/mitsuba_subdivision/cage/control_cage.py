@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -30,8 +31,6 @@ from .validation import (
 )
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from scipy import sparse
 
     from ..refinement.cage_refinement import CageRefinement
@@ -289,9 +288,8 @@ class ControlCage:
         """
         validated = validated_positions(positions, CageSource())
         if len(validated) != self.vertex_count:
-            raise CageError(
-                f"{self.source.name}: {len(validated)} new positions; expected {self.vertex_count}, one per vertex"
-            )
+            expected = f"{self.vertex_count}, one per vertex"
+            raise CageError(f"{self.source.name}: {len(validated)} new positions; expected {expected}")
         cage = type(self).__new__(type(self))
         # Without cached values of a derived class.
         vars(cage).update({item.name: getattr(self, item.name) for item in fields(self)}, positions=validated)

@@ -66,10 +66,8 @@ def require_names(attributes: object, source: CageSource) -> None:
     if not isinstance(attributes, Mapping):
         raise CageError(f"{source.name}: attributes are {attributes!r}; expected a dict of attributes by name")
     if "texcoords" in attributes:
-        raise CageError(
-            f'{source.name}: an attribute is called "texcoords"; expected another name, as texture coordinates are '
-            "a separate argument"
-        )
+        expected = "another name, as texture coordinates are a separate argument"
+        raise CageError(f'{source.name}: an attribute is called "texcoords"; expected {expected}')
 
 
 class FlatFaces(NamedTuple):
@@ -86,10 +84,8 @@ def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSour
     if hasattr(faces, "__array__"):
         table = np.asarray(faces)
         if table.ndim != 2:
-            raise CageError(
-                f"{source.name}: faces have shape {table.shape}; expected an (f, k) array or one vertex sequence per "
-                "face (flat arrays go to ControlCage.from_arrays)"
-            )
+            expected = "an (f, k) array or one vertex sequence per face (flat arrays go to ControlCage.from_arrays)"
+            raise CageError(f"{source.name}: faces have shape {table.shape}; expected {expected}")
         return np.full(len(table), table.shape[1], dtype=np.int64), table.reshape(-1)
     try:
         # Raises TypeError for other types.
@@ -130,21 +126,18 @@ def validated_faces(
         if order is not None:
             topology = Topology(vertex_count, given.face_sizes, read_only(vertices[order]))
             turned = np.unique(given.face[order != np.arange(len(order))])
-            warn(
-                f"{source.name}: {len(turned)} of {number_of(given.face_count, 'face')} turned over, as they were "
-                f"wound against their neighbours: {source.faces(turned, SHOWN)} (numbers count from "
-                f"{source.index_base})"
-            )
+            count = f"{len(turned)} of {number_of(given.face_count, 'face')}"
+            why = f"as they were wound against their neighbours: {source.faces(turned, SHOWN)}"
+            warn(f"{source.name}: {count} turned over, {why} (numbers count from {source.index_base})")
         topology, non_manifold = separated(topology)
         if non_manifold is not None:
             warn(_description(topology, non_manifold, source))
     unused = np.flatnonzero(given.vertex_face_count == 0)
     if len(unused):
         shown = ", ".join(str(vertex + source.index_base) for vertex in unused[:5].tolist())
-        warn(
-            f"{source.name}: {len(unused)} of {vertex_count} vertices are used by no face and have no effect ({shown}"
-            f"{', ...' if len(unused) > 5 else ''}; numbers count from {source.index_base})"
-        )
+        shown += f"{', ...' if len(unused) > 5 else ''}; numbers count from {source.index_base}"
+        count = f"{len(unused)} of {vertex_count} vertices"
+        warn(f"{source.name}: {count} are used by no face and have no effect ({shown})")
     return topology, non_manifold, order
 
 
@@ -218,10 +211,9 @@ def validated_face_indices(topology: Topology, indices: ArrayLike, noun: str, so
     """Check 0-based faces, and return them sorted, without repetitions. Messages call a face ``noun``."""
     faces = _integers(indices, f"{noun}s", source)
     for row in np.flatnonzero((faces < 0) | (faces >= topology.face_count))[:1]:
-        raise CageError(
-            f"{source.at_tag(f'{noun}s', row)}: {noun} {int(faces[row]) + source.index_base} is no face; expected one "
-            f"of {topology.face_count} faces (numbers count from {source.index_base})"
-        )
+        problem = f"{noun} {int(faces[row]) + source.index_base} is no face"
+        expected = f"one of {topology.face_count} faces (numbers count from {source.index_base})"
+        raise CageError(f"{source.at_tag(f'{noun}s', row)}: {problem}; expected {expected}")
     is_chosen = np.zeros(topology.face_count, dtype=bool)
     is_chosen[faces] = True
     return read_only(np.flatnonzero(is_chosen))
@@ -231,10 +223,8 @@ def require_range(indices: NDArray, count: int, where: str) -> None:
     """Raise CageError unless all indices are 0 to ``count - 1``; ``where`` is the beginning of the message."""
     wrong = np.flatnonzero((indices < 0) | (indices >= count))
     if len(wrong):
-        such = number_of_such(len(wrong), "index")
-        raise CageError(
-            f"{where} the index {int(indices[wrong[0]])} at position {wrong[0]}; expected 0 to {count - 1} ({such})"
-        )
+        problem = f"the index {int(indices[wrong[0]])} at position {wrong[0]}"
+        raise CageError(f"{where} {problem}; expected 0 to {count - 1} ({number_of_such(len(wrong), 'index')})")
 
 
 def read_only(array: NDArray) -> NDArray:
@@ -276,10 +266,8 @@ def _check_sizes(sizes: IntArray, corner_count: int, source: CageSource) -> None
         problem = f"has {number_of(int(sizes[small[0]]), 'vertex')}"
         raise source.error(source.at_face(small[0]), problem, "at least 3", len(small), "face")
     if sizes.sum() != corner_count:
-        raise CageError(
-            f"{source.name}: face_sizes add up to {sizes.sum()}, but face_vertices has {corner_count} entries; "
-            "expected as many"
-        )
+        problem = f"face_sizes add up to {sizes.sum()}, but face_vertices has {corner_count} entries"
+        raise CageError(f"{source.name}: {problem}; expected as many")
 
 
 def require_vertices(vertex_count: int, sizes: IntArray, vertices: NDArray[np.integer], source: CageSource) -> None:
@@ -350,10 +338,8 @@ def validated_edges(topology: Topology, edges: ArrayLike, source: CageSource) ->
         (is_first, "is given twice", "each edge once"),
     ):
         for row in np.flatnonzero(~holds)[:1]:
-            raise CageError(
-                f"{source.name}: {source.edge(*ends[row])} {problem}; expected {expected} (numbers count from "
-                f"{source.index_base})"
-            )
+            counting = f"(numbers count from {source.index_base})"
+            raise CageError(f"{source.name}: {source.edge(*ends[row])} {problem}; expected {expected} {counting}")
     return half_edges
 
 
@@ -402,7 +388,5 @@ def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) ->
 def require_sharpness(values: NDArray[np.float64], where: Callable[[int], str]) -> None:
     """Raise CageError if a sharpness is negative or NaN; ``where`` returns the beginning of the message for a row."""
     for row in np.flatnonzero(~(values >= 0))[:1]:
-        raise CageError(
-            f"{where(row)} has sharpness {in_digits(values[row])}; expected 0 for smooth, up to {INFINITE:g} for "
-            "semi-sharp, or more for infinitely sharp"
-        )
+        expected = f"0 for smooth, up to {INFINITE:g} for semi-sharp, or more for infinitely sharp"
+        raise CageError(f"{where(row)} has sharpness {in_digits(values[row])}; expected {expected}")

@@ -13,6 +13,7 @@ from matplotlib.patches import Rectangle
 from ..cage import ControlCage
 from ..cage.named_cages import cube
 from ..messages import print_remark
+from ..mitsuba_mesh import points_at
 from ..regression.scene import render_pixels
 from ..regression.tiers import normal_angle
 from ..surface import LimitSurface
@@ -46,7 +47,7 @@ def draw_zebra(options: FigureOptions) -> list[Path]:
     if options.cage:
         (cage,) = staging.around_vertices(options.cage, 1).values()
         to_corner = staging.motion(staging.frame(LimitSurface(cage)), staging.frame(surface, *at))
-        cage = cage.with_positions(staging.moved(cage.positions, to_corner))
+        cage = cage.with_positions(points_at(cage.positions, to_corner))
         surface, level, at = LimitSurface(cage), OWN_LEVEL, (0, 0)
     shapes, titles = _shapes(surface.cage, level)
     stripes = _stripes(stage.sensors()[0], STRIPES)

@@ -67,9 +67,8 @@ def _elements(content: bytes, name: str, lines: dict[str, IntArray], binary: boo
     try:
         from plyfile import PlyData
     except ImportError:
-        raise CageError(
-            f'{name}: the package plyfile, which reads PLY files, is missing; pip install "mitsuba-subdivision[files]"'
-        ) from None
+        what = "the package plyfile, which reads PLY files, is missing"
+        raise CageError(f'{name}: {what}; pip install "mitsuba-subdivision[files]"') from None
     with warnings.catch_warnings():
         # NumPy warns of elements without rows, and plyfile then raises an error.
         warnings.simplefilter("ignore", UserWarning)

@@ -100,10 +100,8 @@ def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRe
     )
     contents, refined = _with_tags(cage, contents, refinement, corners)
     if not np.array_equal(refined.is_hole, cage.is_hole[element]):
-        raise CageError(
-            f'{cage.source.name}: boundary "{cage.boundary}" would give the refined cage other holes, as a face has '
-            "an edge twice; expected another boundary"
-        )
+        problem = "would give the refined cage other holes, as a face has an edge twice; expected another boundary"
+        raise CageError(f'{cage.source.name}: boundary "{cage.boundary}" {problem}')
     if cage.texcoords is not None or cage.attributes:
         attributes, value_meshes = refined_attributes(cage, scheme, refinement, matrix, corners)
         rules = {**contents.rules, "face_varying": common_mode(cage, refined, value_meshes, corners)}
@@ -145,10 +143,9 @@ def _with_tags(
         sharpness.vertices[corners.vertex[is_missing]] = INFINITE
     if is_wrong.any():
         where = cage.source.at_face(int(cage.topology.face[corners.half_edge[np.argmax(is_wrong)]]))
-        raise CageError(
-            f"{where} and another face share two edges or more, so that refined edges would have the same two ends; "
-            f"expected faces that share one edge at most ({is_wrong.sum()} such refined half-edges)"
-        )
+        problem = "share two edges or more, so that refined edges would have the same two ends"
+        expected = f"expected faces that share one edge at most ({is_wrong.sum()} such refined half-edges)"
+        raise CageError(f"{where} and another face {problem}; {expected}")
     return contents, refined
 
 
@@ -176,10 +173,8 @@ def _dual(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefi
     refinement = scheme.refine(cut)
     t = refinement.topology
     if t.vertex_count != cut.half_edge_count:
-        raise SchemeError(
-            f"{cage.source.name}: the scheme {scheme.name} numbers refined vertices in a way of its own; expected one "
-            "for each face corner, as Doo-Sabin has"
-        )
+        problem = f"the scheme {scheme.name} numbers refined vertices in a way of its own"
+        raise SchemeError(f"{cage.source.name}: {problem}; expected one for each face corner, as Doo-Sabin has")
     matrix = _over_control_points(cage, refinement, np.arange(t.vertex_count))
     attributes, _ = refined_attributes(cage, scheme, refinement, matrix, None)
     contents = replace(contents, positions=matrix @ cage.positions, **attributes)
@@ -220,10 +215,9 @@ class RefinedCorners:
         parents = np.where(kind == VERTEX, cut.face_vertices[half_edge], cut.vertex_count + cut.edge[half_edge])
         known = (kind != FACE) & (len(kind) == refined.half_edge_count)
         if not known.any() or not _are_one_to_one(parents[known], refined.face_vertices[known]):
-            raise SchemeError(
-                f"{cage.source.name}: the scheme {scheme.name} numbers refined faces in a way of its own; expected one "
-                "that refines as Catmull-Clark, Loop or Doo-Sabin do"
-            )
+            problem = f"the scheme {scheme.name} numbers refined faces in a way of its own"
+            expected = "one that refines as Catmull-Clark, Loop or Doo-Sabin do"
+            raise SchemeError(f"{cage.source.name}: {problem}; expected {expected}")
         return corners
 
     @cached_property

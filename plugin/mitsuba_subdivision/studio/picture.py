@@ -194,10 +194,8 @@ def require_denoiser() -> None:
     try:
         import mitsuba_oidn  # noqa: F401 - only to find out whether it is there
     except ImportError as error:
-        raise ValueError(
-            f"the package {error.name}, which denoises pictures by Open Image Denoise, is missing; pip install "
-            '"mitsuba-subdivision[denoise]"'
-        ) from None
+        what = f"the package {error.name}, which denoises pictures by Open Image Denoise, is missing"
+        raise ValueError(f'{what}; pip install "mitsuba-subdivision[denoise]"') from None
 
 
 def render_denoised(

@@ -215,16 +215,12 @@ def _suffix_for(name: str, contents: CageContents) -> str:
         return ".ply"
     first = next(iter(data))
     if not importlib.util.find_spec("pxr"):
-        raise CageError(
-            f'"{first}" of "{name}" cannot be written to an OBJ file; expected the package usd-core, to save '
-            'it as USD: pip install "mitsuba-subdivision[files]"'
-        )
+        expected = 'the package usd-core, to save it as USD: pip install "mitsuba-subdivision[files]"'
+        raise CageError(f'"{first}" of "{name}" cannot be written to an OBJ file; expected {expected}')
     for key in contents.attributes:
         if not usd_stage.is_possible(key) or key in usd_stage.TEXCOORDS:
-            raise CageError(
-                f'attribute "{key}" of "{name}" cannot be written to a file; expected a name of letters, digits and '
-                f'"_" other than {", ".join(usd_stage.TEXCOORDS)}'
-            )
+            expected = f'a name of letters, digits and "_" other than {", ".join(usd_stage.TEXCOORDS)}'
+            raise CageError(f'attribute "{key}" of "{name}" cannot be written to a file; expected {expected}')
     return ".usda"
 
 

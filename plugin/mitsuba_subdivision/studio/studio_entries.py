@@ -120,10 +120,8 @@ def studio(
     low, high = np.sort(box @ axes, axis=0)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
     if not SIZES[0] < 2 * radius < SIZES[1]:
-        warn(
-            f"{prefix}a model {in_digits(2 * radius)} units large; expected {SIZES[0]:g} to {SIZES[1]:g}, beyond which "
-            "Mitsuba's single precision loses light and surfaces"
-        )
+        expected = f"{SIZES[0]:g} to {SIZES[1]:g}, beyond which Mitsuba's single precision loses light and surfaces"
+        warn(f"{prefix}a model {in_digits(2 * radius)} units large; expected {expected}")
     origin, distance = framed(times_matrix(in_world[None], axes)[0], azimuth, elevation, size)
     right, up_in_picture, forward = (axes @ camera_axes(azimuth, elevation)).T
     from_below = elevation < 0

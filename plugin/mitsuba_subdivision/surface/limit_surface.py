@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numbers
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, partial
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,9 +37,6 @@ from ..variants import variant_name
 from .arguments import checked_elements, checked_form, checked_samples, require_derivatives, require_valences
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from types import ModuleType
-
     from scipy import sparse
 
     from ..kernels.surface_kernel import SurfaceKernel
@@ -551,9 +550,8 @@ class LimitSurface:
         if not isinstance(sample_offset, numbers.Real) or not 0 <= sample_offset < 1:
             raise ValueError(f"sample_offset {sample_offset!r}; expected at least 0 and below 1")
         if sample_offset == 0 and evaluator in ("power", "stam"):
-            raise ValueError(
-                f'evaluator "{evaluator}" has no value at extraordinary points; expected a sample_offset above 0'
-            )
+            problem = f'evaluator "{evaluator}" has no value at extraordinary points'
+            raise ValueError(f"{problem}; expected a sample_offset above 0")
         if evaluator == "stabilized" and sample_offset == 0 and dtype == np.float64:
             return table.apply(self.cage.positions)
         half_edge, uv = table.locations()

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
+from ..mesh.cuts import cut_along_seams
 from ..mesh.shared import Content, shared, shared_by_key
 from ..patches.patch_table import PatchTable
 from ..schemes.domain import FloatArray
@@ -37,8 +38,6 @@ class AttributeLayout:
         # Tables of the meshes of channels, and the vertex there of each split vertex
         self._tables: dict[ChannelLayout, tuple[VertexTable, IntArray]] = {}
         if seams := [layout.seam for layout in layouts if layout.seam is not None]:
-            from ..mesh.cuts import cut_along_seams
-
             # Only elements that are faces have seams. Cutting them along seams keeps their half-edges.
             cut = cut_along_seams(patches.topology, np.any(seams, axis=0))
             self._grid = table.grid.cut(PatchTable(cut.topology, patches.scheme, patches.is_hole).elements)

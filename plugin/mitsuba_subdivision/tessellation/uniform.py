@@ -33,10 +33,8 @@ def uniform_table(patches: PatchTable, rate: int) -> VertexTable:
 def _table(patches: PatchTable, rate: int) -> VertexTable:
     grid = UniformGrid(patches.scheme.domain, patches.elements, rate)
     if grid.vertex_count > MOST_VERTICES:
-        raise ValueError(
-            f"tessellation rate {rate} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, whose "
-            "triangles fit into a buffer"
-        )
+        expected = f"at most {MOST_VERTICES}, whose triangles fit into a buffer"
+        raise ValueError(f"tessellation rate {rate} makes {grid.vertex_count} vertices; expected {expected}")
     require_memory(patches, grid)
     polynomials, (controls, refinement) = _polynomials(patches, grid), patches.control_rows()
     counts = patches.control_count, patches.patch_count
