@@ -53,15 +53,11 @@ def joined_cage(cages: Sequence[ControlCage], **rules: str) -> ControlCage:
     return cage_of(joined([cage.contents for cage in cages], "joined cage", rules), **rules)
 
 
-def joined(
-    meshes: Sequence[CageContents],
-    name: str,
-    given: Mapping[str, str] | None = None,  # Rules and scheme that replace those of the meshes
-) -> CageContents:
+def joined(meshes: Sequence[CageContents], name: str, given: Mapping[str, str] | None = None) -> CageContents:
     """Join meshes with valid indices to one cage; messages begin with the name of their file.
 
     Texture coordinates and attributes that not all meshes have, with the same interpolation and width, are dropped with
-    a warning. Meshes of different rules or schemes are an error.
+    a warning. Meshes of different rules or schemes are an error, unless ``given`` replaces them.
     """
     if len(meshes) == 1:
         return meshes[0]

@@ -71,11 +71,11 @@ class CageRefinement:
     corner: IntArray
 
 
-def refine_cage(
-    cage: ControlCage,
-    chosen: str | Scheme | None,  # As for `adapted_scheme`. If not None, it becomes the refined cage's scheme.
-) -> CageRefinement:
-    """Refine a cage once. Raises CageError and SchemeError as `ControlCage.refinement`."""
+def refine_cage(cage: ControlCage, chosen: str | Scheme | None) -> CageRefinement:
+    """Refine a cage once, by a scheme as of `adapted_scheme`; the refined cage names the chosen one.
+
+    Raises CageError and SchemeError as `ControlCage.refinement`.
+    """
     scheme = adapted_scheme(cage, chosen)
     named, source = cage.scheme if chosen is None else scheme.name, CageSource(f"{cage.source.name}, refined")
     contents = replace(cage.contents, texcoords=None, attributes={}, materials={}, scheme=named, source=source)
@@ -257,14 +257,12 @@ class RefinedCorners:
         copies[self.vertex[is_new]] = self.refined.face_vertices[is_new]
         return copies
 
-    def values(
-        self,
-        indices: IntArray,  # (n_h,) int: index of the attribute's value at each face corner of the cage
-    ) -> tuple[IntArray, IntArray]:
+    def values(self, indices: IntArray) -> tuple[IntArray, IntArray]:
         """Return a refined corner ``(n,)`` with each face-varying value, and the value of each corner ``(n_c,)``.
 
-        Refined corners share a value if they are at the same vertex of the refined cage and depend on the same values:
-        that at the coarse vertex, or those at both ends of the edge.
+        Indices ``(n_h,)`` are those of the attribute's values at the cage's face corners. Refined corners share a value
+        if they are at the same vertex of the refined cage and depend on the same values: that at the coarse vertex, or
+        those at both ends of the edge.
         """
         t, h = self.cage.topology, self.half_edge
         start, end = h, np.where(self.kind == EDGE, t.next[h], h)
@@ -368,12 +366,10 @@ def common_mode(
     )
 
 
-def differences(
-    expected: Topology,
-    other: Topology,
-    stays: BoolArray,  # (n_h,) bool: half-edges whose origin does not move, so that it may be a corner
-) -> tuple[BoolArray, BoolArray, BoolArray]:
+def differences(expected: Topology, other: Topology, stays: BoolArray) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Compare two meshes, half-edge by half-edge. Meshes without differences have equal refinements.
+
+    The origin of a half-edge that ``stays`` does not move, so that it may be a corner.
 
     Returns three (n_h,) bool arrays: whether a half-edge of ``other`` has an unexpected twin; whether its origin has
     another `VertexRule`; and whether anything differs, these, or the semi-sharpness of its edge or at its origin.

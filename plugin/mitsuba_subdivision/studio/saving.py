@@ -113,11 +113,9 @@ def _short(value: float) -> str:
 
 
 class _SceneParts:
-    def __init__(
-        self,
-        path: Path,  # Of the scene's XML file. Data of the entry NAME become `SCENE_NAME` with a suffix.
-        inputs: Iterable[Path],  # Files that must not be overwritten
-    ) -> None:
+    """Files beside a scene's XML file: data of the entry NAME become `SCENE_NAME` with a suffix. None is an input."""
+
+    def __init__(self, path: Path, inputs: Iterable[Path]) -> None:
         self._path, self._inputs = path, list(inputs)
         self._writers: dict[Path, Callable[[Path], None]] = {}
         self._pictures: dict[str, Path] = {}

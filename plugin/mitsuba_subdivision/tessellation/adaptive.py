@@ -384,10 +384,7 @@ def _normals_to(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def feature_edges(
-    patches: PatchTable,
-    frames: PatchFrames,
-    points: FloatArray,  # (n_v, 3) float64: control points at the vertices of the mesh
-    criterion: Criterion,
+    patches: PatchTable, frames: PatchFrames, points: FloatArray, criterion: Criterion
 ) -> NDArray[np.bool_]:
     """``(n_h,)`` whether the curve along each half-edge must itself hold to the limit.
 

@@ -23,14 +23,9 @@ if TYPE_CHECKING:
 
 
 class AttributeLayout:
-    """Triangles and vertex locations of a tessellation with attributes, independent of the attributes' values."""
+    """Triangles and vertex locations of a tessellation of patches with attributes, whatever the attributes' values."""
 
-    def __init__(
-        self,
-        table: VertexTable,
-        patches: PatchTable,  # That the table was built from
-        layouts: tuple[ChannelLayout, ...],
-    ) -> None:
+    def __init__(self, table: VertexTable, patches: PatchTable, layouts: tuple[ChannelLayout, ...]) -> None:
         self._table, self._patches, self._grid = table, patches, table.grid
         # (n,) int64 or None: the vertex of the `VertexTable` whose position and normal each split vertex has. None
         # without seams, when both tables have the same vertices.
