@@ -12,18 +12,9 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..mesh import manifold
 from ..mesh.connectivity import INFINITE, IntArray, Topology
 from ..mesh.cuts import Sharpness
-from ..mesh.manifold import (
-    NonManifold,
-    fan_counts,
-    fan_labels,
-    is_manifold,
-    is_repeated,
-    runs_with_twin,
-    separated,
-    turning_order,
-)
 from .contents import RULES
 from .errors import CageError, CageSource, in_digits, number_of, number_of_such, warn
 
@@ -102,7 +93,7 @@ def validated_faces(
     face_vertices: ArrayLike,  # (n_h,) int: 0-based
     source: CageSource,
     strict: bool,  # Whether the faces must be an oriented 2-manifold, closed or with boundary
-) -> tuple[Topology, NonManifold | None, IntArray | None]:
+) -> tuple[Topology, manifold.NonManifold | None, IntArray | None]:
     """Check the faces of a cage, turn over those against their neighbours, and cut the mesh at non-manifold edges.
 
     Raises CageError and warns as `ControlCage` says. Returns `ControlCage.topology` and `ControlCage.non_manifold`;
@@ -119,17 +110,17 @@ def validated_faces(
         sizes = np.broadcast_to(sizes[0], sizes.shape)
     given = topology = Topology(vertex_count, read_only(sizes), read_only(vertices))
     non_manifold = order = None
-    if not is_manifold(given):
+    if not manifold.is_manifold(given):
         if strict:
             _require_manifold(given, source)
-        order = turning_order(given)
+        order = manifold.turning_order(given)
         if order is not None:
             topology = Topology(vertex_count, given.face_sizes, read_only(vertices[order]))
             turned = np.unique(given.face[order != np.arange(len(order))])
             count = f"{len(turned)} of {number_of(given.face_count, 'face')}"
             why = f"as they were wound against their neighbours: {source.faces(turned, SHOWN)}"
             warn(f"{source.name}: {count} turned over, {why} (numbers count from {source.index_base})")
-        topology, non_manifold = separated(topology)
+        topology, non_manifold = manifold.separated(topology)
         if non_manifold is not None:
             warn(_description(topology, non_manifold, source))
     unused = np.flatnonzero(given.vertex_face_count == 0)
@@ -145,7 +136,7 @@ def _require_manifold(t: Topology, source: CageSource) -> None:
     def edge_at(half_edge: int) -> str:
         return source.edge(t.face_vertices[half_edge], t.face_vertices[t.next[half_edge]])
 
-    repeated = np.flatnonzero(is_repeated(t))
+    repeated = np.flatnonzero(manifold.is_repeated(t))
     if len(repeated):
         faces = np.unique(t.face[repeated])
         vertex = t.face_vertices[repeated[t.face[repeated] == faces[0]]].min()
@@ -158,14 +149,14 @@ def _require_manifold(t: Topology, source: CageSource) -> None:
         problem = f"is one of {len(faces)} at {edge_at(half_edges[0])}: {source.faces(faces)}"
         expected = "a manifold surface, at most 2 faces at an edge"
         raise source.error(source.at_face(faces[0]), problem, expected, len(crowded), "edge")
-    same_way = np.flatnonzero(runs_with_twin(t))
+    same_way = np.flatnonzero(manifold.runs_with_twin(t))
     if len(same_way):
         first = same_way[0]
         problem = f"and {source.faces(t.face[t.twin[[first]]])} both run along {edge_at(first)} in this direction"
         expected = "opposite directions, all faces counter-clockwise from outside"
         raise source.error(source.at_face(t.face[first]), problem, expected, len(same_way) // 2, "edge")
-    fan, is_first = fan_labels(t)
-    pinched = np.flatnonzero(fan_counts(t, is_first) > 1)
+    fan, is_first = manifold.fan_labels(t)
+    pinched = np.flatnonzero(manifold.fan_counts(t, is_first) > 1)
     corners = np.flatnonzero(t.face_vertices == pinched[0])
     labels = np.unique(fan[corners])
     fans = [source.faces(t.face[corners[fan[corners] == label]]) for label in labels[:SHOWN]]
@@ -174,14 +165,14 @@ def _require_manifold(t: Topology, source: CageSource) -> None:
     raise source.error(source.at_vertex(pinched[0]), problem, expected, len(pinched), "vertex")
 
 
-def _description(t: Topology, non_manifold: NonManifold, source: CageSource) -> str:
+def _description(t: Topology, non_manifold: manifold.NonManifold, source: CageSource) -> str:
     """The warning about non-manifold edges and vertices: the number of each kind, and the first ones."""
     half_edges = np.flatnonzero(non_manifold.is_edge & ~non_manifold.has_one_face)
     # One half-edge of each edge.
     crowded = half_edges[np.unique(non_manifold.edge[half_edges], return_index=True)[1]]
     ends = np.stack([t.face_vertices[crowded], t.face_vertices[t.next[crowded]]], axis=1)
-    pinched = np.flatnonzero((fan_counts(t, fan_labels(t)[1]) > 1) & ~t.ends_of(non_manifold.is_edge))
-    repeats = np.unique(t.face[is_repeated(t)])
+    pinched = np.flatnonzero((manifold.fan_counts(t, manifold.fan_labels(t)[1]) > 1) & ~t.ends_of(non_manifold.is_edge))
+    repeats = np.unique(t.face[manifold.is_repeated(t)])
     kinds = (
         ("edge", "of more than two faces, or of two in one direction", ends, lambda ends: source.edge(*ends)),
         ("vertex", "between separate fans", pinched, source.vertex),

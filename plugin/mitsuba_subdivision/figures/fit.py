@@ -14,8 +14,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..cage import ControlCage
-from ..cage.named_cages import cube
+from ..cage import ControlCage, cube
 from ..device_arrays import upload
 from ..fit import CageFit, LargeSteps, Schedule, View
 from ..fit.cage_fit import with_sample_count

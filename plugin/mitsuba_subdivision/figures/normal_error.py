@@ -18,14 +18,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from .. import example_file
-from ..cage import ControlCage
-from ..cage.named_cages import extraordinary
+from ..cage import ControlCage, extraordinary
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..mesh.one_ring import RingTable, one_ring
 from ..mitsuba_mesh import points_at
 from ..regression.tiers import normal_angle
-from ..schemes import scheme_named
-from ..schemes.domain import FloatArray
+from ..schemes import FloatArray, scheme_named
 from ..surface import LimitSurface
 from ..tessellation.vertex_table import Tessellation
 from . import staging

@@ -10,8 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 
-from ..cage import ControlCage
-from ..cage.named_cages import cube
+from ..cage import ControlCage, cube
 from ..messages import print_remark
 from ..mitsuba_mesh import points_at
 from ..regression.scene import render_pixels

@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.contents import CageContents
-from ..cage.errors import CageError, warn
+from ..cage import CageContents, CageError, warn
 from ..mesh.connectivity import IntArray
 
 

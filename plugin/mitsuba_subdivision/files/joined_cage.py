@@ -8,11 +8,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..cage import ControlCage, cage_of
-from ..cage.contents import Attribute, CageContents
-from ..cage.errors import CageError, CageSource, shortened, warn
-from ..mesh import ragged
-from ..mesh.connectivity import IntArray
+from ..cage import Attribute, CageContents, CageError, CageSource, ControlCage, cage_of, shortened, warn
+from ..mesh import IntArray, ragged
 
 Value = TypeVar("Value")
 # Parts of a mesh, and an array with a row for each.

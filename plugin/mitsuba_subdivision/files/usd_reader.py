@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from ..cage import validation
 from ..cage.contents import RULES, Attribute, CageContents, validated_attribute
 from ..cage.errors import CageError, CageSource, number_of_such, shortened, warn
-from ..mesh import ragged
-from ..mesh.connectivity import IntArray, Topology
+from ..mesh import IntArray, Topology, ragged
 from . import usd_stage
 from .joined_cage import joined
 from .usd_skinning import Skinning

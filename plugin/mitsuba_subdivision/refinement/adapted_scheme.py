@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..cage.contents import Attribute
-from ..cage.control_cage import ControlCage
-from ..cage.errors import shortened, warn
+from ..cage import Attribute, ControlCage, shortened, warn
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.cuts import seams, value_mesh
 from ..schemes import Scheme, SchemeError, scheme_named, with_rules

@@ -22,8 +22,7 @@ from ..mesh import ragged
 from ..mesh.connectivity import INFINITE, IntArray, Topology, VertexRule
 from ..mesh.cuts import Sharpness, value_mesh
 from ..mesh.manifold import is_later
-from ..schemes import Scheme, SchemeError
-from ..schemes.scheme import Refinement
+from ..schemes import Refinement, Scheme, SchemeError
 from .adapted_scheme import adapted_scheme, subdivided_values
 
 if TYPE_CHECKING:

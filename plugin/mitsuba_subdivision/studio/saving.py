@@ -16,8 +16,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage import CageError, ControlCage, without_warnings
-from ..cage.contents import RULES, CageContents
+from ..cage import RULES, CageContents, CageError, ControlCage, without_warnings
 from ..files import ply, usd_stage
 from ..files.formats import write_file
 from ..shapes.parameters import is_attribute_parameter, ranges_as_text, read_attributes

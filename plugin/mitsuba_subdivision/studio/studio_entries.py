@@ -13,8 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..cage import ControlCage
-from ..cage.errors import CageSource, in_digits, warn
+from ..cage import CageSource, ControlCage, in_digits, warn
 from ..evaluation.equations import times_matrix
 from ..mitsuba_mesh import box_corners
 from ..shapes.foreground import FOREGROUND

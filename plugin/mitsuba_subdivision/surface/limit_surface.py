@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..cage import ControlCage
-from ..cage.contents import TEXCOORDS, attributes_by_name
-from ..cage.errors import CageError
+from ..cage import TEXCOORDS, CageError, ControlCage, attributes_by_name
 from ..evaluation.element import SurfaceSamples, derivative_stencils
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..evaluation.located_samples import limit_stencils
@@ -28,8 +26,7 @@ from ..patches.patch_table import PatchTable
 from ..patches.piece_table import PieceTable
 from ..patches.polynomial_pieces import ElementBounds, SurfacePieces
 from ..refinement.adapted_scheme import adapted_scheme
-from ..schemes import Scheme
-from ..schemes.domain import FloatArray
+from ..schemes import FloatArray, Scheme
 from ..tessellation.attribute_table import AttributeLayout, attribute_table
 from ..tessellation.uniform import uniform_table
 from ..tessellation.vertex_table import Tessellation, VertexMatrices, VertexTable

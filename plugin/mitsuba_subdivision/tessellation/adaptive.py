@@ -22,8 +22,7 @@ from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray
 from ..messages import counted
 from ..patches.patch_table import PatchTable
-from ..schemes.domain import FloatArray
-from ..schemes.scheme import Scheme
+from ..schemes import FloatArray, Scheme
 from . import HIGHEST_RATE
 from .adaptive_grid import (
     DEEPEST,

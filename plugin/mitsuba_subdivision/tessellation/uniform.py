@@ -8,8 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..mesh import ragged
-from ..mesh.connectivity import IntArray
+from ..mesh import IntArray, ragged
 from ..mesh.shared import shared
 from ..patches.patch_table import PatchClass, PatchTable
 from ..schemes.domain import FloatArray

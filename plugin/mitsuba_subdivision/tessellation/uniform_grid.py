@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh import ragged
-from ..mesh.connectivity import IntArray, Topology
+from ..mesh import IntArray, Topology, ragged
 from ..schemes.domain import FloatArray, ParameterDomain
 
 # Vertices per slice when computing triangles, so that arrays stay in a core's cache.

@@ -18,8 +18,7 @@ from ..evaluation.polynomials import monomial_values, polynomial_basis
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray
 from ..patches.patch_table import PatchClass
-from ..schemes.domain import FloatArray
-from ..schemes.scheme import Scheme
+from ..schemes import FloatArray, Scheme
 
 if TYPE_CHECKING:
     from scipy import sparse
