@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from . import picture_detail
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
-from .scaling import scaled, scaled_camera, size_of
-from .scene_entries import LoadedShapes, Surfaces, scene_entries
+from .scene_entries import LoadedShapes, Surfaces, scene_entries, size_of
 from .sensors import NO_BLUR, angles_for, sensor, size_for, with_studio_defaults
 from .stage_warnings import StageWarnings
 from .textures import Textures
@@ -114,8 +113,8 @@ class StageScenes(studio.SceneSource[SceneContents]):
         if self.factor == 1:
             return given
         if self._before is None or self._before[0].shapes is not given.shapes:
-            self._before = given, scaled(given, self.factor)
-        camera = None if given.camera is None else scaled_camera(given.camera, self.factor)
+            self._before = given, given.scaled(self.factor)
+        camera = None if given.camera is None else given.camera.scaled(self.factor)
         return replace(self._before[1], camera=camera, picture=given.picture)
 
     def _delays(self, first: SceneContents) -> list[float]:

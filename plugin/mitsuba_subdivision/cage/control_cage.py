@@ -375,9 +375,7 @@ class ControlCage:
     def triangles(self) -> IndexArray:
         """``(n, 3)`` int32, 0-based vertices of triangles that cover the faces, in order of faces; read-only."""
         corners, _ = triangle_corners(self.positions, self.face_sizes, self.face_vertices)
-        triangles: IndexArray = self.face_vertices[corners]
-        triangles.flags.writeable = False
-        return triangles
+        return validation.read_only(self.face_vertices[corners])
 
     def laplacian(self) -> sparse.csr_array:
         """Return the uniform Laplacian of the cage's edges, ``(n_v, n_v)`` CSR array of float64.

@@ -315,7 +315,8 @@ def _label(axis: Axes, sensor: mi.Sensor, cage: ControlCage, sharpness: FloatArr
     box = {"boxstyle": "round,pad=0.15", "facecolor": LABEL, "edgecolor": "none"}
     middles = project(sensor, cage.positions[cube().edges].mean(axis=1))
     for edge in np.flatnonzero(in_front(cage, camera_matrix(sensor)[:3, 3])):
-        axis.text(*middles[edge], f"{sharpness[edge]:.1f}", color="white", ha="center", va="center", bbox=box)
+        x, y = middles[edge]
+        axis.text(x, y, f"{sharpness[edge]:.1f}", color="white", ha="center", va="center", bbox=box)
 
 
 def in_front(box: ControlCage, camera: NDArray[np.float64]) -> NDArray[np.bool_]:

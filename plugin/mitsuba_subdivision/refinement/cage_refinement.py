@@ -143,8 +143,8 @@ def _with_tags(
     if is_wrong.any():
         where = cage.source.at_face(int(cage.topology.face[corners.half_edge[np.argmax(is_wrong)]]))
         problem = "share two edges or more, so that refined edges would have the same two ends"
-        expected = f"expected faces that share one edge at most ({is_wrong.sum()} such refined half-edges)"
-        raise CageError(f"{where} and another face {problem}; {expected}")
+        hint = f"expected faces that share one edge at most ({is_wrong.sum()} such refined half-edges)"
+        raise CageError(f"{where} and another face {problem}; {hint}")
     return contents, refined
 
 

@@ -242,12 +242,8 @@ class LimitSurface:
         """Area of the surface, in squared units of the cage's space.
 
         Computed by Gauss quadrature of every polynomial piece, at all levels around extraordinary points, to a relative
-        accuracy of 1e-12; where it is folded along a curve inside an element, to about 1e-8 of the pieces there.
-
-        Raises
-        ------
-        SchemeError
-            As `bounds`.
+        accuracy of 1e-12; where it is folded along a curve inside an element, to about 1e-8 of the pieces there. Raises
+        SchemeError as `bounds`.
         """
         areas, rest = self._areas
         return float(sum(part_areas.sum() for part_areas in areas) + rest)

@@ -213,8 +213,7 @@ class TileRates:
 
     def most(self, tiles: Tiles) -> IntArray:
         """``(t,)`` highest rates that tiles may have, which are powers of two, as on sides."""
-        rates: IntArray = np.maximum(1, (1 << self.max_rate.bit_length() - 1) >> tiles["halvings"])
-        return rates
+        return np.maximum(1, (1 << self.max_rate.bit_length() - 1) >> tiles["halvings"])
 
     def triangle_counts(self, tiles: Tiles) -> IntArray:
         """``(t,)`` triangles of tiles with clipped rates, without those that higher rates of neighbours add."""
@@ -349,8 +348,7 @@ def _extent(hull: FloatArray | None, values: FloatArray, axes: Iterable[FloatArr
     """``(t,)`` sizes of hulls of tiles along orthogonal axes ``(3, t)``; infinite for unknown hulls."""
     if hull is None:
         return np.full(values.shape[2], np.inf)
-    extent: FloatArray = np.linalg.norm([np.ptp(times(hull, dot(values, axis)), axis=0) for axis in axes], axis=0)
-    return extent
+    return np.linalg.norm([np.ptp(times(hull, dot(values, axis)), axis=0) for axis in axes], axis=0)
 
 
 def _normals(kind: DividedTile, values: FloatArray, axis: FloatArray) -> Cone:
@@ -369,8 +367,7 @@ def _are_folded(kind: DividedTile, ring: FloatArray, axis: FloatArray) -> NDArra
         return np.ones(axis.shape[1], dtype=bool)
     (a, c, b, d), (x, y) = kind.control_faces, (dot(ring, along) for along in _normals_to(axis))
     areas = (x[c] - x[a]) * (y[d] - y[b]) - (y[c] - y[a]) * (x[d] - x[b])
-    are_folded: NDArray[np.bool_] = areas.min(axis=0) < -FOLDED * areas.max(axis=0)
-    return are_folded
+    return areas.min(axis=0) < -FOLDED * areas.max(axis=0)
 
 
 def _normals_to(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:

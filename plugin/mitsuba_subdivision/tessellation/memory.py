@@ -123,6 +123,5 @@ def _lines(path: Path) -> list[str]:
 
 
 def _number(path: Path) -> int | None:
-    """The number in a file; None if there is no such file, or if it contains no number."""
     lines = _lines(path)
     return int(lines[0]) if lines and lines[0].isdigit() else None
