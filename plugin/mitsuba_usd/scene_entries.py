@@ -35,8 +35,7 @@ from numpy.typing import NDArray
 
 from .bsdfs import bsdf, interior, radiance, rgb
 from .contents import MaterialContents, SceneContents, ShapeContents
-from .emitters import emitter, one_environment
-from .sensors import RESERVED
+from .lights_and_camera import RESERVED, emitter, one_environment
 from .stage_warnings import StageWarnings
 from .textures import Textures
 

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from . import picture_detail
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
+from .lights_and_camera import NO_BLUR, angles_for, sensor, size_for, with_studio_defaults
 from .scene_entries import LoadedShapes, Surfaces, scene_entries, size_of
-from .sensors import NO_BLUR, angles_for, sensor, size_for, with_studio_defaults
 from .stage_warnings import StageWarnings
 from .textures import Textures
 
