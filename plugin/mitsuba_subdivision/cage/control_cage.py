@@ -272,10 +272,7 @@ class ControlCage:
     def with_positions(self, positions: ArrayLike) -> ControlCage:
         """Return a cage with other ``(n_v, 3)`` positions. It shares this cage's structure, without new validation.
 
-        Raises
-        ------
-        CageError
-            If the positions are malformed or their number differs.
+        Raises CageError if the positions are malformed or their number differs.
         """
         validated = validation.validated_positions(positions, CageSource())
         if len(validated) != self.vertex_count:

@@ -24,17 +24,7 @@ from ..messages import counted
 from ..patches.patch_table import PatchTable
 from ..schemes import FloatArray, Scheme
 from . import HIGHEST_RATE
-from .adaptive_grid import (
-    DEEPEST,
-    AdaptiveGrid,
-    PatchFrames,
-    Tiles,
-    child,
-    in_patch,
-    sides_of,
-    tile_type,
-    whole_patches,
-)
+from .adaptive_grid import DEEPEST, AdaptiveGrid, PatchFrames, Tiles, child, in_patch, sides_of, whole_patches
 from .criterion import Cone, Criterion, cone_around, dot, least_product, normal_cone, rounded_up, tangent_cone, unit
 from .memory import require_memory_for_triangles
 from .uniform import checked_rate
@@ -74,7 +64,7 @@ def adaptive_table(
         raise ValueError(f"max_rate {max_rate}; expected at most {HIGHEST_RATE} segments per edge")
     frames, points = PatchFrames.of(patches), control_points[patches.control_of_vertex]
     rates = TileRates(patches.scheme, frames, criterion, max_rate)
-    none = np.empty(0, dtype=tile_type(patches.scheme.domain.corner_count))
+    none = whole_patches(np.arange(0), patches.scheme.domain.corner_count)
     needed = np.concatenate([none, *_divided(rates, _whole_patches(patches, rates, points))])
     u, v = needed["origin"].T
     needed = needed[np.lexsort((needed["is_flipped"], u, v, needed["depth"], needed["corner"]))]
