@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from .cage import ControlCage
-from .cage.contents import RULES, attributes_by_name
+from .cage import RULES, ControlCage, attributes_by_name
 from .mesh.connectivity import IntArray, Topology, VertexRule
 from .mesh.cuts import seams
 from .surface import LimitSurface

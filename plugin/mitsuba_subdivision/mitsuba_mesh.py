@@ -149,7 +149,7 @@ def with_meshes(scene: SceneNode) -> SceneNode:
     return {name: entry for name, entry in entries.items() if name not in bsdfs or name in used}
 
 
-def points_at(points: NDArray, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def points_at(points: NDArray, matrix: NDArray[np.floating]) -> NDArray[np.float64]:
     """Points ``(n, 3)`` transformed by a matrix ``(4, 4)``, or by several ``(m, 4, 4)``: ``(m, n, 3)``."""
     return points @ matrix[..., :3, :3].swapaxes(-2, -1) + matrix[..., None, :3, 3]
 

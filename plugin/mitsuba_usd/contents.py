@@ -166,6 +166,13 @@ class LightContents:
     texture: str | None = None  # Path of an image that multiplies the radiance
     pole: str = "y"  # Axis of a dome's image
 
+    def scaled(self, factor: float) -> LightContents:
+        """The light with all lengths multiplied by a factor, and the same radiance."""
+        # Power is divided by the area of the light, or by the square of the distance.
+        grows = self.is_normalized and self.kind not in ("distant", "dome")
+        emission = [factor**2 * channel for channel in self.emission] if grows else self.emission
+        return replace(self, to_world=np.diag([factor, factor, factor, 1.0]) @ self.to_world, emission=emission)
+
 
 @dataclass(frozen=True, eq=False)
 class CameraContents:
@@ -185,6 +192,16 @@ class CameraContents:
     shutter: list[float]  # Time codes of its opening and closing, relative to the frame
     conform_policy: str = "expandAperture"  # Value of aspectRatioConformPolicy
     mitsuba: dict[str, Any] = field(default_factory=dict)  # Authored parameters of Mitsuba's sensor
+
+    def scaled(self, factor: float) -> CameraContents:
+        """The camera with all lengths of the world multiplied by a factor; the film of a perspective camera stays."""
+        to_world = self.to_world.copy()
+        to_world[:3, 3] *= factor
+        film = 1.0 if self.is_perspective else factor
+        lengths = ("near", "far", "lens_radius", "focus_distance")
+        changed: dict[str, Any] = {name: factor * getattr(self, name) for name in lengths}
+        changed |= {name: [film * length for length in getattr(self, name)] for name in ("aperture", "offset")}
+        return replace(self, to_world=to_world, **changed)
 
 
 WHOLE = [0.0, 0.0, 1.0, 1.0]  # Least and largest x and y of a picture, whose y points up
@@ -246,3 +263,29 @@ class SceneContents:
     def has_surfaces(self) -> bool:
         """Whether there are limit surfaces."""
         return any(shape.cage.scheme is not None for shape in self.all_shapes)
+
+    def scaled(self, factor: float) -> SceneContents:
+        """The same picture with all lengths multiplied by a factor: light leaks below small models (`enlargement`)."""
+        scale = np.diag([factor, factor, factor, 1.0])
+        materials: dict[MaterialContents | None, MaterialContents | None] = {}
+
+        def of_material(material: MaterialContents | None) -> MaterialContents | None:
+            depth = 0.0 if material is None else material.inputs.get("depth", 0.0)
+            if material is not None and material not in materials and isinstance(depth, (int, float)) and depth > 0:
+                materials[material] = replace(material, inputs={**material.inputs, "depth": depth * factor})
+            return materials.get(material, material)
+
+        def of_shape(shape: ShapeContents, matrix: NDArray) -> ShapeContents:
+            power = factor**2 if shape.whole_light else 1.0
+            radiance = None if shape.radiance is None else [power * channel for channel in shape.radiance]
+            shape = replace(shape, material=of_material(shape.material), radiance=radiance)
+            return replace(shape, to_world=matrix @ shape.to_world)
+
+        return replace(
+            self,
+            shapes=[of_shape(shape, scale) for shape in self.shapes],
+            groups=[[of_shape(shape, np.eye(4)) for shape in group] for group in self.groups],
+            instances=[replace(instance, to_world=scale @ instance.to_world) for instance in self.instances],
+            lights=[light.scaled(factor) for light in self.lights],
+            camera=None if self.camera is None else self.camera.scaled(factor),
+        )

@@ -35,8 +35,7 @@ from numpy.typing import NDArray
 
 from .bsdfs import bsdf, interior, radiance, rgb
 from .contents import MaterialContents, SceneContents, ShapeContents
-from .emitters import emitter, one_environment
-from .sensors import RESERVED
+from .lights_and_camera import RESERVED, emitter, one_environment
 from .stage_warnings import StageWarnings
 from .textures import Textures
 
@@ -132,6 +131,16 @@ def scene_entries(
     return {**scene, **rest}
 
 
+def size_of(contents: SceneContents) -> float:
+    """The largest side of a box around all control points; 0 if there are none."""
+    boxes = [
+        points_at(box_corners(np.stack([points.min(axis=0), points.max(axis=0)])), matrices).reshape(-1, 3)
+        for shape, matrices in contents.placements.items()
+        if len(points := shape.cage.positions)
+    ]
+    return float(np.ptp(np.concatenate(boxes), axis=0).max()) if boxes else 0.0
+
+
 class Surfaces:
     """Cache of limit surfaces: all four bishops share one."""
 
@@ -180,7 +189,6 @@ class Surfaces:
         return np.asarray(points[np.isfinite(points).all(axis=1)])
 
     def _points_of(self, shape: ShapeContents) -> NDArray[np.float64]:
-        """Points in the space of the shape."""
         cage, key = shape.cage, (shape.name, shape.material.name if shape.material else None)
         positions = np.asarray(cage.positions, dtype=np.float64)
         if cage.scheme is None:

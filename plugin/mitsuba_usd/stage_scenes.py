@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 from . import picture_detail
 from .contents import SceneContents, ShapeContents
 from .copies import with_copies, with_large_copies
-from .scaling import scaled, scaled_camera, size_of
-from .scene_entries import LoadedShapes, Surfaces, scene_entries
-from .sensors import NO_BLUR, angles_for, sensor, size_for, with_studio_defaults
+from .lights_and_camera import NO_BLUR, angles_for, sensor, size_for, with_studio_defaults
+from .scene_entries import LoadedShapes, Surfaces, scene_entries, size_of
 from .stage_warnings import StageWarnings
 from .textures import Textures
 
@@ -114,8 +113,8 @@ class StageScenes(studio.SceneSource[SceneContents]):
         if self.factor == 1:
             return given
         if self._before is None or self._before[0].shapes is not given.shapes:
-            self._before = given, scaled(given, self.factor)
-        camera = None if given.camera is None else scaled_camera(given.camera, self.factor)
+            self._before = given, given.scaled(self.factor)
+        camera = None if given.camera is None else given.camera.scaled(self.factor)
         return replace(self._before[1], camera=camera, picture=given.picture)
 
     def _delays(self, first: SceneContents) -> list[float]:
@@ -125,10 +124,8 @@ class StageScenes(studio.SceneSource[SceneContents]):
         if opens >= closes:
             times = f"shutter:open is {in_digits(opens)}, and shutter:close {in_digits(closes)}"
             problem = times if first.camera else "there is no camera"
-            raise CageError(
-                f"{self.name}: {problem}; expected a camera whose shutter opens before it closes, and render settings "
-                "without disableMotionBlur, or an interval, such as --shutter -0.25:0.25"
-            )
+            camera = "a camera whose shutter opens before it closes, and render settings without disableMotionBlur"
+            raise CageError(f"{self.name}: {problem}; expected {camera}, or an interval, such as --shutter -0.25:0.25")
         return [opens + (closes - opens) * (part + 0.5) / self._shutter for part in range(self._shutter)]
 
     def framing(self, contents: SceneContents) -> tuple[str, studio.View, tuple[int, int]]:

@@ -27,7 +27,8 @@ from mitsuba_subdivision.figures import (
     staging,
 )
 from mitsuba_subdivision.figures.output import rows_of, write_figure
-from mitsuba_subdivision.figures.staging import around_vertices, frame, load_stage, motion, moved, project, visible
+from mitsuba_subdivision.figures.staging import around_vertices, frame, load_stage, motion, project, visible
+from mitsuba_subdivision.mitsuba_mesh import points_at
 from mitsuba_subdivision.regression.image import read_channels
 from mitsuba_subdivision.schemes import scheme_named
 from patches.closed_cages import extraordinary_triangles, torus
@@ -59,8 +60,7 @@ def coarse(monkeypatch):
     constants = {
         "cages": {"CREASE_RATE": 3},
         "normal_error": {"VALENCES": (3,), "OFFSETS": (0,), "LEVELS": np.arange(3), "TURNS": normal_error.TURNS[:2]},
-        "scenes": {"COLUMNS": 96, "ROWS": 96},
-        "zebra": {"FINE_LEVEL": 3, "OWN_LEVEL": 3, "STRIPE_PIXELS": 256},
+        "scenes": {"COLUMNS": 96, "ROWS": 96, "FINE_LEVEL": 3, "OWN_LEVEL": 3, "STRIPE_PIXELS": 256},
         "fit": {"STEPS": 2, "CREASE_STEPS": 1, "RATE": 4, "PIXELS": 12, "BOX_PIXELS": 12, "VIEWS": 2, "SPP": 1}
         | {"TARGET_SPP": 1, "SAMPLES": 500, "FINE": 3, "DENSE": 3},
     }
@@ -147,7 +147,7 @@ def test_cages_around_a_vertex_have_it_first_and_at_the_given_place(users_cage):
         original = original.refined()
     np.testing.assert_array_equal(*(np.sort(each.positions, axis=0) for each in (cage, original)))
     like = frame(LimitSurface(extraordinary(5)))
-    placed = cage.with_positions(moved(cage.positions, motion(frame(LimitSurface(cage)), like)))
+    placed = cage.with_positions(points_at(cage.positions, motion(frame(LimitSurface(cage)), like)))
     for result, expected in zip(frame(LimitSurface(placed)), like, strict=True):
         np.testing.assert_allclose(result, expected, atol=1e-9)
 
@@ -383,7 +383,7 @@ def test_projected_points_are_where_pictures_show_them():
         alpha = np.array(mi.render(scene, spp=64), dtype=np.float64)[..., 3]
         y, x = np.indices(alpha.shape) + 0.5
         centre = np.array([(alpha * x).sum(), (alpha * y).sum()]) / alpha.sum()
-        np.testing.assert_allclose(project(scene.sensors()[0], place), centre, atol=0.1)
+        np.testing.assert_allclose(project(scene.sensors()[0], place[None])[0], centre, atol=0.1)
     towards = np.array([3, -4, 5]) / np.sqrt(50)
     assert visible(scene, place + 0.1 * np.stack([towards, -towards])).tolist() == [True, False]
 

@@ -11,7 +11,7 @@ from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage import Attribute
 from mitsuba_subdivision.cage.contents import RULES, CageContents, same
 from mitsuba_subdivision.cage.named_cages import cube, extraordinary
-from mitsuba_subdivision.files.formats import FORMATS, Format, write_triangles
+from mitsuba_subdivision.files.formats import FORMATS, Format, Triangles, write_triangles
 from patches.closed_cages import tetrahedron
 from reference.refined_cages import tagged
 from usd import stages
@@ -242,7 +242,7 @@ def data_of(triangles, np_rng):
 
 
 def save(path, triangles, *data):
-    write_triangles(path, triangles.positions, triangles.normals, triangles.triangles, *data)
+    write_triangles(path, Triangles(triangles.positions, triangles.normals, triangles.triangles, *data))
 
 
 # Of OBJ files, Mitsuba numbers vertices anew, and its parser of numbers is right to a few units in the last place.
@@ -252,7 +252,7 @@ def save(path, triangles, *data):
 def test_mitsuba_reads_files(tmp_path, triangles, variant_scalar_rgb, np_rng, kind, options, rtol, atol):  # noqa: ARG001
     texcoords, attributes = data_of(triangles, np_rng)
     path = tmp_path / f"surface.{kind}"
-    save(path, triangles, texcoords, attributes if kind == "ply" else None)
+    save(path, triangles, texcoords, attributes if kind == "ply" else {})
     shape = mi.traverse(mi.load_dict({"type": kind, "filename": str(path), **options}))
     faces, corners = np.array(shape["faces"]), triangles.triangles.ravel()
     assert kind == "obj" or np.array_equal(faces, corners)
@@ -269,7 +269,7 @@ def test_obj_files_keep_every_bit(tmp_path, triangles, np_rng, dtype, with_texco
     positions = (np_rng.normal(size=(count, 3)) * 10.0 ** np_rng.integers(-30, 30, (count, 3))).astype(dtype)
     texcoords = np_rng.random((count, 2)).astype(dtype) if with_texcoords else None
     path = tmp_path / "surface.obj"
-    write_triangles(path, positions, triangles.normals, triangles.triangles, texcoords)
+    write_triangles(path, Triangles(positions, triangles.normals, triangles.triangles, texcoords, {}))
     cage = ControlCage.from_file(path)
     np.testing.assert_array_equal(cage.positions.astype(dtype), positions)
     np.testing.assert_array_equal(cage.face_vertices, triangles.triangles.ravel())

@@ -87,18 +87,15 @@ def validated_attribute(
     indices = np.arange(corner_count) if indices is None else indices
     # Not copied before the length is checked, as a damaged file may have any number of indices.
     if indices.shape != (corner_count,) or not np.issubdtype(indices.dtype, np.integer):
-        raise CageError(
-            f"{label} has indices of shape {indices.shape} and type {indices.dtype}; expected {corner_count} integers, "
-            "one per face corner"
-        )
+        expected = f"expected {corner_count} integers, one per face corner"
+        raise CageError(f"{label} has indices of shape {indices.shape} and type {indices.dtype}; {expected}")
     wrong = np.flatnonzero((indices < 0) | (indices >= len(values)))
     if len(wrong):
         corner = int(wrong[0])
         face = int(topology.face[corner])
-        raise CageError(
-            f"{source.at_face(face)}: corner {corner - int(topology.face_offsets[face])} has index {indices[corner]} "
-            f'into attribute "{shortened(name)}"; expected 0 to {len(values) - 1} ({len(wrong)} such corners)'
-        )
+        where = f"{source.at_face(face)}: corner {corner - int(topology.face_offsets[face])}"
+        problem = f'has index {indices[corner]} into attribute "{shortened(name)}"'
+        raise CageError(f"{where} {problem}; expected 0 to {len(values) - 1} ({len(wrong)} such corners)")
     indices = (indices if order is None else indices[order]).astype(np.int64)
     indices.flags.writeable = False
     return Attribute(values, interpolation, indices)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -15,23 +16,11 @@ from ..mesh.cuts import CutMesh, SharpMesh, Sharpness
 from ..mesh.manifold import NonManifold
 from ..mesh.triangulation import triangle_corners
 from ..variants import variant_module
+from . import validation
 from .contents import RULES, Attribute, CageContents, shape_properties, validated_attribute
 from .errors import CageError, CageSource
-from .validation import (
-    FlatFaces,
-    flattened_faces,
-    require_names,
-    require_rules,
-    validated_face_indices,
-    validated_faces,
-    validated_holes,
-    validated_positions,
-    validated_tags,
-)
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from scipy import sparse
 
     from ..refinement.cage_refinement import CageRefinement
@@ -159,14 +148,15 @@ class ControlCage:
         source = source or CageSource()
         if not isinstance(strict, (bool, np.bool_)):
             raise CageError(f"{source.name}: strict is {strict!r}; expected True or False")
-        sizes, vertices = flattened_faces(faces, source)
+        sizes, vertices = validation.flattened_faces(faces, source)
         rules: dict[str, Any] = dict(zip(RULES, (boundary, crease_method, triangle_rule, face_varying), strict=True))
-        require_rules(rules, source)
+        validation.require_rules(rules, source)
         attributes = {} if attributes is None else attributes
-        require_names(attributes, source)
-        validated = validated_positions(positions, source)
-        topology, non_manifold, order = validated_faces(len(validated), sizes, vertices, source, strict)
-        tags, holes = validated_tags(topology, creases, corners, source), validated_holes(topology, holes, source)
+        validation.require_names(attributes, source)
+        validated = validation.validated_positions(positions, source)
+        topology, non_manifold, order = validation.validated_faces(len(validated), sizes, vertices, source, strict)
+        tags = validation.validated_tags(topology, creases, corners, source)
+        holes = validation.validated_holes(topology, holes, source)
         structure = SharpMesh(topology, non_manifold, tags, **rules, holes=holes).shared()
         topology = structure.topology
 
@@ -180,7 +170,7 @@ class ControlCage:
             "texcoords": None if texcoords is None else checked(texcoords, "texcoords", 2),
             "attributes": {name: checked(attribute, name) for name, attribute in attributes.items()},
             "materials": {
-                name: validated_face_indices(topology, faces, "material face", source)
+                name: validation.validated_face_indices(topology, faces, "material face", source)
                 for name, faces in (materials or {}).items()
             },
             "scheme": scheme,
@@ -210,7 +200,7 @@ class ControlCage:
         CageError
             As the constructor, or if ``face_sizes`` do not add up to the length of ``face_vertices``.
         """
-        return cls(positions, FlatFaces(np.asarray(face_sizes), np.asarray(face_vertices)), **options)
+        return cls(positions, validation.FlatFaces(np.asarray(face_sizes), np.asarray(face_vertices)), **options)
 
     @classmethod
     def from_file(
@@ -282,16 +272,12 @@ class ControlCage:
     def with_positions(self, positions: ArrayLike) -> ControlCage:
         """Return a cage with other ``(n_v, 3)`` positions. It shares this cage's structure, without new validation.
 
-        Raises
-        ------
-        CageError
-            If the positions are malformed or their number differs.
+        Raises CageError if the positions are malformed or their number differs.
         """
-        validated = validated_positions(positions, CageSource())
+        validated = validation.validated_positions(positions, CageSource())
         if len(validated) != self.vertex_count:
-            raise CageError(
-                f"{self.source.name}: {len(validated)} new positions; expected {self.vertex_count}, one per vertex"
-            )
+            expected = f"{self.vertex_count}, one per vertex"
+            raise CageError(f"{self.source.name}: {len(validated)} new positions; expected {expected}")
         cage = type(self).__new__(type(self))
         # Without cached values of a derived class.
         vars(cage).update({item.name: getattr(self, item.name) for item in fields(self)}, positions=validated)
@@ -386,9 +372,7 @@ class ControlCage:
     def triangles(self) -> IndexArray:
         """``(n, 3)`` int32, 0-based vertices of triangles that cover the faces, in order of faces; read-only."""
         corners, _ = triangle_corners(self.positions, self.face_sizes, self.face_vertices)
-        triangles: IndexArray = self.face_vertices[corners]
-        triangles.flags.writeable = False
-        return triangles
+        return validation.read_only(self.face_vertices[corners])
 
     def laplacian(self) -> sparse.csr_array:
         """Return the uniform Laplacian of the cage's edges, ``(n_v, n_v)`` CSR array of float64.

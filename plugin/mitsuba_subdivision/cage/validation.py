@@ -12,18 +12,9 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..mesh import manifold
 from ..mesh.connectivity import INFINITE, IntArray, Topology
 from ..mesh.cuts import Sharpness
-from ..mesh.manifold import (
-    NonManifold,
-    fan_counts,
-    fan_labels,
-    is_manifold,
-    is_repeated,
-    runs_with_twin,
-    separated,
-    turning_order,
-)
 from .contents import RULES
 from .errors import CageError, CageSource, in_digits, number_of, number_of_such, warn
 
@@ -66,10 +57,8 @@ def require_names(attributes: object, source: CageSource) -> None:
     if not isinstance(attributes, Mapping):
         raise CageError(f"{source.name}: attributes are {attributes!r}; expected a dict of attributes by name")
     if "texcoords" in attributes:
-        raise CageError(
-            f'{source.name}: an attribute is called "texcoords"; expected another name, as texture coordinates are '
-            "a separate argument"
-        )
+        expected = "another name, as texture coordinates are a separate argument"
+        raise CageError(f'{source.name}: an attribute is called "texcoords"; expected {expected}')
 
 
 class FlatFaces(NamedTuple):
@@ -86,10 +75,8 @@ def flattened_faces(faces: Sequence[Sequence[int]] | ArrayLike, source: CageSour
     if hasattr(faces, "__array__"):
         table = np.asarray(faces)
         if table.ndim != 2:
-            raise CageError(
-                f"{source.name}: faces have shape {table.shape}; expected an (f, k) array or one vertex sequence per "
-                "face (flat arrays go to ControlCage.from_arrays)"
-            )
+            expected = "an (f, k) array or one vertex sequence per face (flat arrays go to ControlCage.from_arrays)"
+            raise CageError(f"{source.name}: faces have shape {table.shape}; expected {expected}")
         return np.full(len(table), table.shape[1], dtype=np.int64), table.reshape(-1)
     try:
         # Raises TypeError for other types.
@@ -106,7 +93,7 @@ def validated_faces(
     face_vertices: ArrayLike,  # (n_h,) int: 0-based
     source: CageSource,
     strict: bool,  # Whether the faces must be an oriented 2-manifold, closed or with boundary
-) -> tuple[Topology, NonManifold | None, IntArray | None]:
+) -> tuple[Topology, manifold.NonManifold | None, IntArray | None]:
     """Check the faces of a cage, turn over those against their neighbours, and cut the mesh at non-manifold edges.
 
     Raises CageError and warns as `ControlCage` says. Returns `ControlCage.topology` and `ControlCage.non_manifold`;
@@ -123,28 +110,25 @@ def validated_faces(
         sizes = np.broadcast_to(sizes[0], sizes.shape)
     given = topology = Topology(vertex_count, read_only(sizes), read_only(vertices))
     non_manifold = order = None
-    if not is_manifold(given):
+    if not manifold.is_manifold(given):
         if strict:
             _require_manifold(given, source)
-        order = turning_order(given)
+        order = manifold.turning_order(given)
         if order is not None:
             topology = Topology(vertex_count, given.face_sizes, read_only(vertices[order]))
             turned = np.unique(given.face[order != np.arange(len(order))])
-            warn(
-                f"{source.name}: {len(turned)} of {number_of(given.face_count, 'face')} turned over, as they were "
-                f"wound against their neighbours: {source.faces(turned, SHOWN)} (numbers count from "
-                f"{source.index_base})"
-            )
-        topology, non_manifold = separated(topology)
+            count = f"{len(turned)} of {number_of(given.face_count, 'face')}"
+            why = f"as they were wound against their neighbours: {source.faces(turned, SHOWN)}"
+            warn(f"{source.name}: {count} turned over, {why} (numbers count from {source.index_base})")
+        topology, non_manifold = manifold.separated(topology)
         if non_manifold is not None:
             warn(_description(topology, non_manifold, source))
     unused = np.flatnonzero(given.vertex_face_count == 0)
     if len(unused):
         shown = ", ".join(str(vertex + source.index_base) for vertex in unused[:5].tolist())
-        warn(
-            f"{source.name}: {len(unused)} of {vertex_count} vertices are used by no face and have no effect ({shown}"
-            f"{', ...' if len(unused) > 5 else ''}; numbers count from {source.index_base})"
-        )
+        shown += f"{', ...' if len(unused) > 5 else ''}; numbers count from {source.index_base}"
+        count = f"{len(unused)} of {vertex_count} vertices"
+        warn(f"{source.name}: {count} are used by no face and have no effect ({shown})")
     return topology, non_manifold, order
 
 
@@ -152,7 +136,7 @@ def _require_manifold(t: Topology, source: CageSource) -> None:
     def edge_at(half_edge: int) -> str:
         return source.edge(t.face_vertices[half_edge], t.face_vertices[t.next[half_edge]])
 
-    repeated = np.flatnonzero(is_repeated(t))
+    repeated = np.flatnonzero(manifold.is_repeated(t))
     if len(repeated):
         faces = np.unique(t.face[repeated])
         vertex = t.face_vertices[repeated[t.face[repeated] == faces[0]]].min()
@@ -165,14 +149,14 @@ def _require_manifold(t: Topology, source: CageSource) -> None:
         problem = f"is one of {len(faces)} at {edge_at(half_edges[0])}: {source.faces(faces)}"
         expected = "a manifold surface, at most 2 faces at an edge"
         raise source.error(source.at_face(faces[0]), problem, expected, len(crowded), "edge")
-    same_way = np.flatnonzero(runs_with_twin(t))
+    same_way = np.flatnonzero(manifold.runs_with_twin(t))
     if len(same_way):
         first = same_way[0]
         problem = f"and {source.faces(t.face[t.twin[[first]]])} both run along {edge_at(first)} in this direction"
         expected = "opposite directions, all faces counter-clockwise from outside"
         raise source.error(source.at_face(t.face[first]), problem, expected, len(same_way) // 2, "edge")
-    fan, is_first = fan_labels(t)
-    pinched = np.flatnonzero(fan_counts(t, is_first) > 1)
+    fan, is_first = manifold.fan_labels(t)
+    pinched = np.flatnonzero(manifold.fan_counts(t, is_first) > 1)
     corners = np.flatnonzero(t.face_vertices == pinched[0])
     labels = np.unique(fan[corners])
     fans = [source.faces(t.face[corners[fan[corners] == label]]) for label in labels[:SHOWN]]
@@ -181,14 +165,14 @@ def _require_manifold(t: Topology, source: CageSource) -> None:
     raise source.error(source.at_vertex(pinched[0]), problem, expected, len(pinched), "vertex")
 
 
-def _description(t: Topology, non_manifold: NonManifold, source: CageSource) -> str:
+def _description(t: Topology, non_manifold: manifold.NonManifold, source: CageSource) -> str:
     """The warning about non-manifold edges and vertices: the number of each kind, and the first ones."""
     half_edges = np.flatnonzero(non_manifold.is_edge & ~non_manifold.has_one_face)
     # One half-edge of each edge.
     crowded = half_edges[np.unique(non_manifold.edge[half_edges], return_index=True)[1]]
     ends = np.stack([t.face_vertices[crowded], t.face_vertices[t.next[crowded]]], axis=1)
-    pinched = np.flatnonzero((fan_counts(t, fan_labels(t)[1]) > 1) & ~t.ends_of(non_manifold.is_edge))
-    repeats = np.unique(t.face[is_repeated(t)])
+    pinched = np.flatnonzero((manifold.fan_counts(t, manifold.fan_labels(t)[1]) > 1) & ~t.ends_of(non_manifold.is_edge))
+    repeats = np.unique(t.face[manifold.is_repeated(t)])
     kinds = (
         ("edge", "of more than two faces, or of two in one direction", ends, lambda ends: source.edge(*ends)),
         ("vertex", "between separate fans", pinched, source.vertex),
@@ -218,10 +202,9 @@ def validated_face_indices(topology: Topology, indices: ArrayLike, noun: str, so
     """Check 0-based faces, and return them sorted, without repetitions. Messages call a face ``noun``."""
     faces = _integers(indices, f"{noun}s", source)
     for row in np.flatnonzero((faces < 0) | (faces >= topology.face_count))[:1]:
-        raise CageError(
-            f"{source.at_tag(f'{noun}s', row)}: {noun} {int(faces[row]) + source.index_base} is no face; expected one "
-            f"of {topology.face_count} faces (numbers count from {source.index_base})"
-        )
+        problem = f"{noun} {int(faces[row]) + source.index_base} is no face"
+        expected = f"one of {topology.face_count} faces (numbers count from {source.index_base})"
+        raise CageError(f"{source.at_tag(f'{noun}s', row)}: {problem}; expected {expected}")
     is_chosen = np.zeros(topology.face_count, dtype=bool)
     is_chosen[faces] = True
     return read_only(np.flatnonzero(is_chosen))
@@ -231,10 +214,8 @@ def require_range(indices: NDArray, count: int, where: str) -> None:
     """Raise CageError unless all indices are 0 to ``count - 1``; ``where`` is the beginning of the message."""
     wrong = np.flatnonzero((indices < 0) | (indices >= count))
     if len(wrong):
-        such = number_of_such(len(wrong), "index")
-        raise CageError(
-            f"{where} the index {int(indices[wrong[0]])} at position {wrong[0]}; expected 0 to {count - 1} ({such})"
-        )
+        problem = f"the index {int(indices[wrong[0]])} at position {wrong[0]}"
+        raise CageError(f"{where} {problem}; expected 0 to {count - 1} ({number_of_such(len(wrong), 'index')})")
 
 
 def read_only(array: NDArray) -> NDArray:
@@ -276,10 +257,8 @@ def _check_sizes(sizes: IntArray, corner_count: int, source: CageSource) -> None
         problem = f"has {number_of(int(sizes[small[0]]), 'vertex')}"
         raise source.error(source.at_face(small[0]), problem, "at least 3", len(small), "face")
     if sizes.sum() != corner_count:
-        raise CageError(
-            f"{source.name}: face_sizes add up to {sizes.sum()}, but face_vertices has {corner_count} entries; "
-            "expected as many"
-        )
+        problem = f"face_sizes add up to {sizes.sum()}, but face_vertices has {corner_count} entries"
+        raise CageError(f"{source.name}: {problem}; expected as many")
 
 
 def require_vertices(vertex_count: int, sizes: IntArray, vertices: NDArray[np.integer], source: CageSource) -> None:
@@ -350,10 +329,8 @@ def validated_edges(topology: Topology, edges: ArrayLike, source: CageSource) ->
         (is_first, "is given twice", "each edge once"),
     ):
         for row in np.flatnonzero(~holds)[:1]:
-            raise CageError(
-                f"{source.name}: {source.edge(*ends[row])} {problem}; expected {expected} (numbers count from "
-                f"{source.index_base})"
-            )
+            counting = f"(numbers count from {source.index_base})"
+            raise CageError(f"{source.name}: {source.edge(*ends[row])} {problem}; expected {expected} {counting}")
     return half_edges
 
 
@@ -402,7 +379,5 @@ def _half_edges_between(topology: Topology, starts: IntArray, ends: IntArray) ->
 def require_sharpness(values: NDArray[np.float64], where: Callable[[int], str]) -> None:
     """Raise CageError if a sharpness is negative or NaN; ``where`` returns the beginning of the message for a row."""
     for row in np.flatnonzero(~(values >= 0))[:1]:
-        raise CageError(
-            f"{where(row)} has sharpness {in_digits(values[row])}; expected 0 for smooth, up to {INFINITE:g} for "
-            "semi-sharp, or more for infinitely sharp"
-        )
+        expected = f"0 for smooth, up to {INFINITE:g} for semi-sharp, or more for infinitely sharp"
+        raise CageError(f"{where(row)} has sharpness {in_digits(values[row])}; expected {expected}")

@@ -26,10 +26,8 @@ COMMANDS = {
 }
 
 
-def parser(
-    words: Sequence[str] = tuple(COMMANDS),  # Of the command line: only its commands get options
-) -> CommandParser:
-    """The parser of the whole command line."""
+def parser(words: Sequence[str] = tuple(COMMANDS)) -> CommandParser:
+    """The parser of the whole command line, in which only commands among the words have options."""
     about, hint = "Exact subdivision surfaces for Mitsuba 3.", f'"{PROGRAM} COMMAND --help" describes a command.'
     program = CommandParser(prog=PROGRAM, description=about, allow_abbrev=False, epilog=hint)
     program.add_argument("--version", action="version", version=f"%(prog)s {__version__}")

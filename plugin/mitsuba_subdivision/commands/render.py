@@ -51,7 +51,6 @@ def _shutter_of(text: str) -> tuple[int, tuple[float, float] | None]:
 
 
 def _environment_of(text: str) -> dict[str, Any]:
-    """Fields of `Look` for an environment."""
     path, turn, strength = re.fullmatch(r"(.+?)(?:,turn=([^,]*))?(?:,strength=([^,]*))?", text).groups()  # type: ignore[union-attr]
     return {"environment": Path(path), "turn": float(turn or 0), "strength": float(strength or 1)}
 

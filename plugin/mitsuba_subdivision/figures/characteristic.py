@@ -21,8 +21,7 @@ from ..evaluation.polynomials import polynomial_basis
 from ..mesh.connectivity import Topology
 from ..mesh.one_ring import one_ring
 from ..mesh.signature import Fan, Signature
-from ..schemes import Scheme, scheme_named
-from ..schemes.domain import FloatArray, ParameterDomain, ParameterMap
+from ..schemes import FloatArray, ParameterDomain, ParameterMap, Scheme, scheme_named
 from ..surface import LimitSurface
 from .output import SERIES, FigureOptions, hide_frame, label_powers, panels, write_figure
 from .staging import around_vertices, frame, grid_points

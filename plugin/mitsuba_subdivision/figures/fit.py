@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -15,14 +14,14 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from ..cage import ControlCage
-from ..cage.named_cages import cube
+from ..cage import ControlCage, cube
 from ..device_arrays import upload
 from ..fit import CageFit, LargeSteps, Schedule, View
 from ..fit.cage_fit import with_sample_count
 from ..fit.point_fit import mesh_samples
 from ..fit.smoothness import rows
 from ..messages import counted
+from ..mitsuba_mesh import CurveSet
 from ..schemes.domain import FloatArray
 from ..shapes.derivatives import loss_of_views
 from ..surface import LimitSurface
@@ -258,14 +257,9 @@ def _ball_panels(shape: ControlCage, courses: Mapping[str, Course]) -> list[Pane
     return [*shown, (title("dense mesh", STEPS, mesh), as_mesh(mesh))]
 
 
-def _rods(cage: ControlCage) -> mi.Shape:
-    """A cage's edges as rods, by a file of curves with both ends of each edge and an empty line."""
-    ends = cage.positions[cage.edges].tolist()
-    curves = ("\n".join(f"{x:.6f} {y:.6f} {z:.6f} {ROD_RADIUS}" for x, y, z in edge) for edge in ends)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "edges.txt"
-        path.write_text("\n\n".join(curves), encoding="ascii")
-        return mi.load_dict({"type": "linearcurve", "filename": str(path), "bsdf": RODS})
+def _rods(cage: ControlCage) -> mi.Object:
+    ends = np.insert(cage.positions[cage.edges].reshape(-1, 3), 3, ROD_RADIUS, axis=1)
+    return CurveSet("linearcurve", ends, np.full(len(cage.edges), 2)).loaded(mi.load_dict(RODS))
 
 
 def _box_panels(boxes: Sequence[Box]) -> list[Panel]:
@@ -319,8 +313,9 @@ def _finish(axis: Axes, quantity: str, *, is_logarithmic: bool = False) -> None:
 
 def _label(axis: Axes, sensor: mi.Sensor, cage: ControlCage, sharpness: FloatArray) -> None:
     box = {"boxstyle": "round,pad=0.15", "facecolor": LABEL, "edgecolor": "none"}
+    middles = project(sensor, cage.positions[cube().edges].mean(axis=1))
     for edge in np.flatnonzero(in_front(cage, camera_matrix(sensor)[:3, 3])):
-        x, y = project(sensor, cage.positions[cube().edges[edge]].mean(axis=0)).tolist()
+        x, y = middles[edge]
         axis.text(x, y, f"{sharpness[edge]:.1f}", color="white", ha="center", va="center", bbox=box)
 
 

@@ -18,13 +18,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from .. import example_file
-from ..cage import ControlCage
-from ..cage.named_cages import extraordinary
+from ..cage import ControlCage, extraordinary
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..mesh.one_ring import RingTable, one_ring
+from ..mitsuba_mesh import points_at
 from ..regression.tiers import normal_angle
-from ..schemes import scheme_named
-from ..schemes.domain import FloatArray
+from ..schemes import FloatArray, scheme_named
 from ..surface import LimitSurface
 from ..tessellation.vertex_table import Tessellation
 from . import staging
@@ -146,7 +145,7 @@ def _draw_lines(axis: Axes, sensor: mi.Sensor, surface: LimitSurface, mesh: Tess
     edges = edges[np.linalg.norm(edges[:, 0] - edges[0, 0], axis=1) < EDGE_RADIUS]
     width, height = sensor.film().crop_size()
     axis.set(xlim=(0, width), ylim=(height, 0))
-    needles, edges = (staging.project(sensor, staging.moved(points, to_world)) for points in (needles, edges))
+    needles, edges = (staging.project(sensor, points_at(points, to_world)) for points in (needles, edges))
     first, *others = needles  # The first needle is that of the extraordinary vertex
     axis.add_collection(LineCollection(list(edges), colors="#40362a", linewidths=0.3, alpha=0.4))
     axis.add_collection(LineCollection(others, colors="#1c4f72", linewidths=0.6, capstyle="round"))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .. import example_file
 from ..cage import ControlCage
 from ..device_arrays import upload
-from ..mitsuba_mesh import mitsuba_mesh
+from ..mitsuba_mesh import mitsuba_mesh, points_at
 from ..regression.scene import load_scene, render_parts
 from ..srgb import decoded
 from ..surface import LimitSurface
@@ -153,7 +153,7 @@ def render_panels(options: FigureOptions, axes: Any, scenes: Iterable[tuple[str,
 
 
 def project(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Pixel coordinates ``(.., 2)`` of world points ``(.., 3)``."""
+    """Pixel coordinates ``(.., n, 2)`` of world points ``(.., n, 3)``."""
     parameters = mi.traverse(sensor)
     camera = _in_camera(sensor, points)
     # Mitsuba's cameras look along +z, with x to the left and y up. An orthographic camera covers -1 to 1 in x and y.
@@ -190,7 +190,7 @@ def camera_matrix(sensor: mi.Sensor) -> NDArray[np.float64]:
 
 
 def _in_camera(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.float64]:
-    return moved(points, np.linalg.inv(camera_matrix(sensor)))
+    return points_at(points, np.linalg.inv(camera_matrix(sensor)))
 
 
 def around_vertices(path: Path, most: int) -> dict[str, ControlCage]:
@@ -218,11 +218,6 @@ def motion(old: tuple[NDArray[np.float64], ...], new: tuple[NDArray[np.float64],
     matrix[:3, :3] = new[1] @ old[1].T * (new[2] / old[2])
     matrix[:3, 3] = new[0] - matrix[:3, :3] @ old[0]
     return matrix
-
-
-def moved(points: NDArray[np.floating], matrix: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Points ``(.., 3)`` after an affine map ``(4, 4)``."""
-    return np.asarray(points @ matrix[:3, :3].T + matrix[:3, 3], dtype=np.float64)
 
 
 def read(path: Path) -> ControlCage:

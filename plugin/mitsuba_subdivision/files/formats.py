@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.contents import CageContents
-from ..cage.errors import CageError, warn
+from ..cage import CageContents, CageError, warn
 from ..mesh.connectivity import IntArray
 
 
@@ -96,17 +95,9 @@ def require_triangle_format(path: str | Path) -> str:
     return _known_suffix(path, writable, 'format "{}" of triangles', ValueError)
 
 
-def write_triangles(
-    path: str | Path,
-    positions: NDArray,
-    normals: NDArray,
-    triangles: NDArray,
-    texcoords: NDArray | None = None,
-    attributes: Mapping[str, NDArray] | None = None,
-) -> None:
-    """Write `Triangles`; see `Tessellation.save`."""
-    write = function_named(FORMATS[require_triangle_format(path)].write_triangles)
-    write(path, Triangles(positions, normals, triangles, texcoords, attributes or {}))
+def write_triangles(path: str | Path, surface: Triangles) -> None:
+    """Write triangles; see `Tessellation.save`."""
+    function_named(FORMATS[require_triangle_format(path)].write_triangles)(path, surface)
 
 
 def faces_by_name(names: Sequence[str], number: IntArray) -> dict[str, IntArray]:

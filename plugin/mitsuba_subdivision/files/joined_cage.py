@@ -8,11 +8,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..cage import ControlCage, cage_of
-from ..cage.contents import Attribute, CageContents
-from ..cage.errors import CageError, CageSource, shortened, warn
-from ..mesh import ragged
-from ..mesh.connectivity import IntArray
+from ..cage import Attribute, CageContents, CageError, CageSource, ControlCage, cage_of, shortened, warn
+from ..mesh import IntArray, ragged
 
 Value = TypeVar("Value")
 # Parts of a mesh, and an array with a row for each.
@@ -53,15 +50,11 @@ def joined_cage(cages: Sequence[ControlCage], **rules: str) -> ControlCage:
     return cage_of(joined([cage.contents for cage in cages], "joined cage", rules), **rules)
 
 
-def joined(
-    meshes: Sequence[CageContents],
-    name: str,
-    given: Mapping[str, str] | None = None,  # Rules and scheme that replace those of the meshes
-) -> CageContents:
+def joined(meshes: Sequence[CageContents], name: str, given: Mapping[str, str] | None = None) -> CageContents:
     """Join meshes with valid indices to one cage; messages begin with the name of their file.
 
     Texture coordinates and attributes that not all meshes have, with the same interpolation and width, are dropped with
-    a warning. Meshes of different rules or schemes are an error.
+    a warning. Meshes of different rules or schemes are an error, unless ``given`` replaces them.
     """
     if len(meshes) == 1:
         return meshes[0]

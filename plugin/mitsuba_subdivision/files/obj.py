@@ -16,10 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.contents import RULES, Attribute, CageContents
-from ..cage.errors import CageError, CageSource, shortened, warn
-from ..mesh import ragged
-from ..mesh.connectivity import IntArray
+from ..cage import RULES, Attribute, CageContents, CageError, CageSource, shortened, warn
+from ..mesh import IntArray, ragged
 from ..whole_file import whole_file
 from .formats import Triangles, faces_by_name, material_of_face, warn_of_losses
 

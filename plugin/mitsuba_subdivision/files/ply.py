@@ -15,10 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage.contents import RULES, Attribute, CageContents
-from ..cage.errors import CageError, CageSource, shortened, warn
-from ..mesh import ragged
-from ..mesh.connectivity import IntArray
+from ..cage import RULES, Attribute, CageContents, CageError, CageSource, shortened, warn
+from ..mesh import IntArray, ragged
 from ..whole_file import whole_file
 from .formats import Triangles, faces_by_name, material_of_face, warn_of_losses
 
@@ -67,9 +65,8 @@ def _elements(content: bytes, name: str, lines: dict[str, IntArray], binary: boo
     try:
         from plyfile import PlyData
     except ImportError:
-        raise CageError(
-            f'{name}: the package plyfile, which reads PLY files, is missing; pip install "mitsuba-subdivision[files]"'
-        ) from None
+        what = "the package plyfile, which reads PLY files, is missing"
+        raise CageError(f'{name}: {what}; pip install "mitsuba-subdivision[files]"') from None
     with warnings.catch_warnings():
         # NumPy warns of elements without rows, and plyfile then raises an error.
         warnings.simplefilter("ignore", UserWarning)

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from ..cage import validation
 from ..cage.contents import RULES, Attribute, CageContents, validated_attribute
 from ..cage.errors import CageError, CageSource, number_of_such, shortened, warn
-from ..mesh import ragged
-from ..mesh.connectivity import IntArray, Topology
+from ..mesh import IntArray, Topology, ragged
 from . import usd_stage
 from .joined_cage import joined
 from .usd_skinning import Skinning
@@ -29,15 +28,12 @@ Read = TypeVar("Read")
 
 
 def read_usd(
-    path: str | Path,
-    prim: str | None = None,
-    time: float | None = None,
-    rules: Mapping[str, str] | None = None,  # Rules and scheme that replace the mesh's own
+    path: str | Path, prim: str | None = None, time: float | None = None, rules: Mapping[str, str] | None = None
 ) -> CageContents:
     """Read a mesh of a USD file, or all meshes, with subdivision attributes and primvars, in world space.
 
-    ``prim``, ``time``, errors and warnings are those of `ControlCage.from_file`; the cage is not validated. Faces of
-    left-handed and mirrored meshes become counter-clockwise from outside. Skeletons and blend shapes move the points.
+    Arguments, errors and warnings are those of `ControlCage.from_file`; the cage is not validated. Faces of left-handed
+    and mirrored meshes become counter-clockwise from outside. Skeletons and blend shapes move the points.
     """
     name = f'"{path}"'
     if time is not None and not math.isfinite(time):
@@ -269,11 +265,7 @@ class MeshReader:
         return matrix
 
     def _primvars(
-        self,
-        order: IntArray | None,  # `reversed_order`, if the orientation of faces is reversed
-        topology: Topology,
-        chosen: Collection[str] | None,
-        first_name: str | None,
+        self, order: IntArray | None, topology: Topology, chosen: Collection[str] | None, first_name: str | None
     ) -> tuple[Attribute | None, dict[str, Attribute]]:
         """Texture coordinates and attributes, from primvars of floating-point numbers.
 

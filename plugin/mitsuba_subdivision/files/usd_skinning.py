@@ -15,13 +15,9 @@ if TYPE_CHECKING:
 
 
 class Skinning:
-    """Evaluates UsdSkel at one time, for the meshes of a stage."""
+    """Evaluates UsdSkel at one time, for the meshes of a stage; reports messages and the path of the mesh."""
 
-    def __init__(
-        self,
-        time: Usd.TimeCode,
-        report: Callable[[str, object], None],  # Gets messages and the path of the mesh
-    ) -> None:
+    def __init__(self, time: Usd.TimeCode, report: Callable[[str, object], None]) -> None:
         from pxr import UsdGeom, UsdSkel
 
         self.time, self._report = time, report

@@ -41,9 +41,8 @@ def require_usd(name: str, use: str = "reads") -> None:
     try:
         import pxr  # noqa: F401 - only to find out whether it is missing
     except ImportError:
-        raise CageError(
-            f'{name}: the package usd-core, which {use} USD files, is missing; pip install "mitsuba-subdivision[files]"'
-        ) from None
+        what = f"the package usd-core, which {use} USD files, is missing"
+        raise CageError(f'{name}: {what}; pip install "mitsuba-subdivision[files]"') from None
 
 
 def open_stage(

@@ -12,8 +12,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..cage import ControlCage
-from ..cage.contents import TEXCOORDS, attributes_by_name
+from ..cage import TEXCOORDS, ControlCage, attributes_by_name
 from ..device_arrays import upload
 from ..mesh.connectivity import IntArray
 from ..refinement.cage_refinement import CageRefinement, built

@@ -89,10 +89,7 @@ class Fit(ABC):
     def step(self) -> float:
         """Take a step, and return the loss before it.
 
-        Raises
-        ------
-        CageError, SchemeError
-            If a due refinement of the cage is impossible: see `ControlCage.refinement`.
+        Raises CageError and SchemeError as `ControlCage.refinement` if the cage is due to be refined.
         """
         number = len(self.losses)
         if self._is_time_to_refine(number):
@@ -142,10 +139,7 @@ class Fit(ABC):
     def refine(self) -> None:
         """Refine the cage once: the same surface, with about four times as many control points.
 
-        Raises
-        ------
-        CageError, SchemeError
-            As `ControlCage.refinement`.
+        Raises CageError and SchemeError as `ControlCage.refinement`.
         """
         refinement = self.cage.refinement(self._scheme)
         self._follow(refinement)
@@ -155,13 +149,7 @@ class Fit(ABC):
         self._load(LimitSurface(self._start, self._scheme), refinement.cage.positions)
 
     def save_checkpoint(self, path: str | Path) -> None:
-        """Write the state for `resume`.
-
-        Raises
-        ------
-        OSError
-            If the file cannot be written; an existing one is then unchanged.
-        """
+        """Write the state for `resume`. If the file cannot be written, raises OSError; an existing one is unchanged."""
         _save(path, self._arrays())
 
     def _arrays(self) -> dict[str, Any]:

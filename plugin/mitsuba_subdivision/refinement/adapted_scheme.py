@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..cage.contents import Attribute
-from ..cage.control_cage import ControlCage
-from ..cage.errors import shortened, warn
+from ..cage import Attribute, ControlCage, shortened, warn
 from ..mesh.connectivity import IntArray, Topology
 from ..mesh.cuts import seams, value_mesh
 from ..schemes import Scheme, SchemeError, scheme_named, with_rules
@@ -20,22 +18,17 @@ def adapted_scheme(cage: ControlCage, chosen: str | Scheme | None) -> Scheme:
     has no surface. Warns if the cage's file names another scheme.
     """
     scheme = _with_rules_of(cage, chosen)
-    cut = cage.cut_mesh
+    cut, source = cage.cut_mesh, cage.source
     if scheme.element == "vertex" and cut.topology.is_border_vertex.all():
-        raise SchemeError(
-            f"{cage.source.name}: the scheme {scheme.name} makes no surface of a cage without inner vertices"
-        )
+        raise SchemeError(f"{source.name}: the scheme {scheme.name} makes no surface of a cage without inner vertices")
     if scheme.element == "face" and cage.is_hole.all():
-        raise SchemeError(f'{cage.source.name}: boundary "none" leaves no face, as all are holes or touch the boundary')
-    unsupported = scheme.unsupported(cut.topology)
-    if unsupported is not None:
-        source, first = cage.source, int(unsupported.indices[0])
-        first = first if unsupported.kind == "face" else int(cut.vertex[first])
-        where = source.at_face(first) if unsupported.kind == "face" else source.at_vertex(first)
-        raise SchemeError(
-            f"{where} {unsupported.problem}; the scheme {scheme.name} expects {unsupported.expected} "
-            f"({len(unsupported.indices)} in all; numbers count from {source.index_base})"
-        )
+        raise SchemeError(f'{source.name}: boundary "none" leaves no face, as all are holes or touch the boundary')
+    if (unsupported := scheme.unsupported(cut.topology)) is not None:
+        first = int(unsupported.indices[0])
+        where = source.at_face(first) if unsupported.kind == "face" else source.at_vertex(int(cut.vertex[first]))
+        expected = f"the scheme {scheme.name} expects {unsupported.expected}"
+        count = f"{len(unsupported.indices)} in all; numbers count from {source.index_base}"
+        raise SchemeError(f"{where} {unsupported.problem}; {expected} ({count})")
     return scheme
 
 
@@ -79,17 +72,14 @@ def subdivided_values(cage: ControlCage, scheme: Scheme, name: str, attribute: A
     if scheme.element == "face":
         topology, value_index = value_mesh(cage.structure, cage.face_varying, indices)
         if not scheme.has_phantom_points and ((topology.twin < 0).any() or topology.vertex_rules.any()):
-            raise SchemeError(
-                f"{label} seams, {of_attribute}, as it states no phantom_points; expected an attribute without seams, "
-                'or face_varying "all"'
-            )
+            expected = 'expected an attribute without seams, or face_varying "all"'
+            raise SchemeError(f"{label} seams, {of_attribute}, as it states no phantom_points; {expected}")
         return topology, value_index
     has_seams = seams(cage.topology, indices).any()
     if has_seams or attribute.interpolation == "varying" or cage.face_varying == "all":
-        raise SchemeError(
-            f"{label} {'seams' if has_seams else 'linear interpolation'}, {of_attribute}; expected one that is "
-            "subdivided as points are, without seams"
-        )
+        lacking = "seams" if has_seams else "linear interpolation"
+        expected = "one that is subdivided as points are, without seams"
+        raise SchemeError(f"{label} {lacking}, {of_attribute}; expected {expected}")
     topology = cage.cut_mesh.topology
     value_index = np.zeros(topology.vertex_count, dtype=np.int64)
     value_index[topology.face_vertices] = indices

@@ -22,8 +22,7 @@ from ..mesh import ragged
 from ..mesh.connectivity import INFINITE, IntArray, Topology, VertexRule
 from ..mesh.cuts import Sharpness, value_mesh
 from ..mesh.manifold import is_later
-from ..schemes import Scheme, SchemeError
-from ..schemes.scheme import Refinement
+from ..schemes import Refinement, Scheme, SchemeError
 from .adapted_scheme import adapted_scheme, subdivided_values
 
 if TYPE_CHECKING:
@@ -71,11 +70,11 @@ class CageRefinement:
     corner: IntArray
 
 
-def refine_cage(
-    cage: ControlCage,
-    chosen: str | Scheme | None,  # As for `adapted_scheme`. If not None, it becomes the refined cage's scheme.
-) -> CageRefinement:
-    """Refine a cage once. Raises CageError and SchemeError as `ControlCage.refinement`."""
+def refine_cage(cage: ControlCage, chosen: str | Scheme | None) -> CageRefinement:
+    """Refine a cage once, by a scheme as of `adapted_scheme`; the refined cage names the chosen one.
+
+    Raises CageError and SchemeError as `ControlCage.refinement`.
+    """
     scheme = adapted_scheme(cage, chosen)
     named, source = cage.scheme if chosen is None else scheme.name, CageSource(f"{cage.source.name}, refined")
     contents = replace(cage.contents, texcoords=None, attributes={}, materials={}, scheme=named, source=source)
@@ -100,10 +99,8 @@ def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRe
     )
     contents, refined = _with_tags(cage, contents, refinement, corners)
     if not np.array_equal(refined.is_hole, cage.is_hole[element]):
-        raise CageError(
-            f'{cage.source.name}: boundary "{cage.boundary}" would give the refined cage other holes, as a face has '
-            "an edge twice; expected another boundary"
-        )
+        problem = "would give the refined cage other holes, as a face has an edge twice; expected another boundary"
+        raise CageError(f'{cage.source.name}: boundary "{cage.boundary}" {problem}')
     if cage.texcoords is not None or cage.attributes:
         attributes, value_meshes = refined_attributes(cage, scheme, refinement, matrix, corners)
         rules = {**contents.rules, "face_varying": common_mode(cage, refined, value_meshes, corners)}
@@ -145,10 +142,9 @@ def _with_tags(
         sharpness.vertices[corners.vertex[is_missing]] = INFINITE
     if is_wrong.any():
         where = cage.source.at_face(int(cage.topology.face[corners.half_edge[np.argmax(is_wrong)]]))
-        raise CageError(
-            f"{where} and another face share two edges or more, so that refined edges would have the same two ends; "
-            f"expected faces that share one edge at most ({is_wrong.sum()} such refined half-edges)"
-        )
+        problem = "share two edges or more, so that refined edges would have the same two ends"
+        hint = f"expected faces that share one edge at most ({is_wrong.sum()} such refined half-edges)"
+        raise CageError(f"{where} and another face {problem}; {hint}")
     return contents, refined
 
 
@@ -176,10 +172,8 @@ def _dual(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRefi
     refinement = scheme.refine(cut)
     t = refinement.topology
     if t.vertex_count != cut.half_edge_count:
-        raise SchemeError(
-            f"{cage.source.name}: the scheme {scheme.name} numbers refined vertices in a way of its own; expected one "
-            "for each face corner, as Doo-Sabin has"
-        )
+        problem = f"the scheme {scheme.name} numbers refined vertices in a way of its own"
+        raise SchemeError(f"{cage.source.name}: {problem}; expected one for each face corner, as Doo-Sabin has")
     matrix = _over_control_points(cage, refinement, np.arange(t.vertex_count))
     attributes, _ = refined_attributes(cage, scheme, refinement, matrix, None)
     contents = replace(contents, positions=matrix @ cage.positions, **attributes)
@@ -220,10 +214,9 @@ class RefinedCorners:
         parents = np.where(kind == VERTEX, cut.face_vertices[half_edge], cut.vertex_count + cut.edge[half_edge])
         known = (kind != FACE) & (len(kind) == refined.half_edge_count)
         if not known.any() or not _are_one_to_one(parents[known], refined.face_vertices[known]):
-            raise SchemeError(
-                f"{cage.source.name}: the scheme {scheme.name} numbers refined faces in a way of its own; expected one "
-                "that refines as Catmull-Clark, Loop or Doo-Sabin do"
-            )
+            problem = f"the scheme {scheme.name} numbers refined faces in a way of its own"
+            expected = "one that refines as Catmull-Clark, Loop or Doo-Sabin do"
+            raise SchemeError(f"{cage.source.name}: {problem}; expected {expected}")
         return corners
 
     @cached_property
@@ -263,14 +256,12 @@ class RefinedCorners:
         copies[self.vertex[is_new]] = self.refined.face_vertices[is_new]
         return copies
 
-    def values(
-        self,
-        indices: IntArray,  # (n_h,) int: index of the attribute's value at each face corner of the cage
-    ) -> tuple[IntArray, IntArray]:
+    def values(self, indices: IntArray) -> tuple[IntArray, IntArray]:
         """Return a refined corner ``(n,)`` with each face-varying value, and the value of each corner ``(n_c,)``.
 
-        Refined corners share a value if they are at the same vertex of the refined cage and depend on the same values:
-        that at the coarse vertex, or those at both ends of the edge.
+        Indices ``(n_h,)`` are those of the attribute's values at the cage's face corners. Refined corners share a value
+        if they are at the same vertex of the refined cage and depend on the same values: that at the coarse vertex, or
+        those at both ends of the edge.
         """
         t, h = self.cage.topology, self.half_edge
         start, end = h, np.where(self.kind == EDGE, t.next[h], h)
@@ -374,12 +365,10 @@ def common_mode(
     )
 
 
-def differences(
-    expected: Topology,
-    other: Topology,
-    stays: BoolArray,  # (n_h,) bool: half-edges whose origin does not move, so that it may be a corner
-) -> tuple[BoolArray, BoolArray, BoolArray]:
+def differences(expected: Topology, other: Topology, stays: BoolArray) -> tuple[BoolArray, BoolArray, BoolArray]:
     """Compare two meshes, half-edge by half-edge. Meshes without differences have equal refinements.
+
+    The origin of a half-edge that ``stays`` does not move, so that it may be a corner.
 
     Returns three (n_h,) bool arrays: whether a half-edge of ``other`` has an unexpected twin; whether its origin has
     another `VertexRule`; and whether anything differs, these, or the semi-sharpness of its edge or at its origin.

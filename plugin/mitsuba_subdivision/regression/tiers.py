@@ -110,7 +110,6 @@ def pixel_of_largest(values: NDArray[np.floating]) -> tuple[int, int]:
 
 
 def _skipped_without(name: str, reference: object | None, test: object | None, what: str) -> TierResult:
-    """Result of a tier whose data are missing in at least one of both images."""
     lacking = "images have" if reference is test is None else "reference has" if reference is None else "test has"
     return TierResult(name, Status.SKIPPED, [f"the {lacking} no {what}"])
 
@@ -248,7 +247,6 @@ def relative_difference(reference: NDArray[np.floating], test: NDArray[np.floati
 
 
 def _different_samples(reference: Image, test: Image) -> str | None:
-    """Reason why the samples of two images differ, None if they are the same."""
     for role, image in (("reference", reference), ("test", test)):
         if "paired" not in image.metadata:
             return f"the {role} does not say with which seed its first batch was rendered"

@@ -1,6 +1,7 @@
 """Subdivision schemes: refinement rules, regular bases and parameter domains."""
 
 from .catmull_clark import CatmullClark
+from .domain import FloatArray, ParameterDomain, ParameterMap
 from .doo_sabin import DooSabin
 from .loop import Loop
 from .scheme import (
@@ -16,8 +17,9 @@ from .scheme import (
 )
 
 __all__ = [
-    "BUILT_IN", "CatmullClark", "DooSabin", "Loop", "PhantomPoint", "Refinement", "Scheme", "SchemeError",
-    "StencilTable", "Unsupported", "register_scheme", "scheme_named", "with_rules",
+    "BUILT_IN", "CatmullClark", "DooSabin", "FloatArray", "Loop", "ParameterDomain", "ParameterMap", "PhantomPoint",
+    "Refinement", "Scheme", "SchemeError", "StencilTable", "Unsupported", "register_scheme", "scheme_named",
+    "with_rules",
 ]  # fmt: skip
 
 BUILT_IN = tuple(kind.name for kind in (CatmullClark, DooSabin, Loop))  # Names of the schemes of this package

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..mesh import ragged
-from ..mesh.connectivity import Topology
+from ..mesh import Topology, ragged
 from ..mesh.signature import ElementKind
 from .domain import IDENTITY, SQUARE, FloatArray, ParameterMap
 from .scheme import Refinement, Scheme, StencilTable, Unsupported, tensor_basis

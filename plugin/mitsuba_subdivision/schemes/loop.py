@@ -67,12 +67,7 @@ class Loop(Scheme):
     )
 
     def vertex_weight(self, valence: NDArray) -> NDArray:
-        """Return the weight beta of each neighbour of a vertex. Variants of Loop's scheme may override it.
-
-        Parameters
-        ----------
-        valence : (n,) float64
-        """
+        """Return the weight beta of each neighbour of vertices of these valences ``(n,)``. Variants may override it."""
         return (5 / 8 - (3 / 8 + np.cos(2 * np.pi / valence) / 4) ** 2) / valence
 
     def unsupported(self, topology: Topology) -> Unsupported | None:

@@ -258,13 +258,7 @@ def tensor_basis(u: FloatArray, v: FloatArray, derivatives: int) -> FloatArray:
 
 
 def scheme_named(name: str) -> Scheme:
-    """Return the scheme of a name.
-
-    Raises
-    ------
-    SchemeError
-        If the name is unknown; the message lists the known names.
-    """
+    """Return the scheme of a name. Raises a SchemeError that lists the known names if there is none."""
     if name not in _SCHEMES:
         raise SchemeError(f'unknown scheme "{name}"; known schemes: {", ".join(sorted(_SCHEMES))}')
     return _SCHEMES[name]
@@ -274,10 +268,7 @@ def scheme_named(name: str) -> Scheme:
 def with_rules(scheme: Scheme, crease_method: str, triangle_rule: str) -> Scheme:
     """Return the scheme with the rules of a cage: a copy, or the scheme itself if it has these rules.
 
-    Raises
-    ------
-    SchemeError
-        If the scheme does not support the rules. Only Catmull-Clark has another rule for triangles.
+    Raises SchemeError if the scheme does not support them. Only Catmull-Clark has another rule for triangles.
     """
     rules = {"crease_method": (crease_method, "uniform"), "triangle_rule": (triangle_rule, "catmull_clark")}
     changed = {name: rule for name, (rule, default) in rules.items() if rule != (getattr(scheme, name) or default)}

@@ -57,7 +57,6 @@ class SceneSource(ABC, Generic[Contents]):
             raise FileNotFoundError(f'"{missing[0]}": there is no such file{more}; expected one for each frame')
 
     def _file_and_time(self, number: int | None) -> tuple[Path, float | None]:
-        """File and time code of a frame, or of the still picture."""
         if number is None or self.numbers is None:
             return self._path, self._time
         if not self._has_files:

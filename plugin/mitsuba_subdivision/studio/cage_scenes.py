@@ -49,14 +49,9 @@ def frame_table(surface: LimitSurface) -> VertexTable:
 
 
 class Model:
-    """A cage, its limit surface, and rods and balls that show the cage."""
+    """A cage, in memory or as chosen from a file, its limit surface, and rods and balls that show the cage."""
 
-    def __init__(
-        self,
-        cage: ControlCage,
-        path: Path | None = None,  # Its file; None for a cage in memory
-        **chosen: Any,  # `prim`, `time` and `scheme` as for `ControlCage.from_file`
-    ) -> None:
+    def __init__(self, cage: ControlCage, path: Path | None = None, **chosen: Any) -> None:
         self.path, self.chosen = path, {name: value for name, value in chosen.items() if value is not None}
         self.cage, self.surface = cage, LimitSurface(cage, self.chosen.get("scheme"))
 

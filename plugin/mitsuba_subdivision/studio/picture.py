@@ -55,24 +55,20 @@ def shading_for(parameters: SceneNode) -> str:
 
 
 def segments_for(
-    cage: ControlCage,
-    to_world: NDArray[np.float64],  # (n, 4, 4) float64: of each copy of the cage
-    outline: SceneNode,  # Of the sensor; see `outline_for`
-    near_clip: float,  # Of the sensor
-    shading: str,
+    cage: ControlCage, to_world: NDArray[np.float64], outline: SceneNode, near_clip: float, shading: str
 ) -> NDArray[np.int64]:
-    """Rates ``(n,)`` of a cage's copies, up to `FINEST_RATE`, without visible facets in an image."""
+    """Rates ``(n,)`` of a cage's copies ``(n, 4, 4)``, up to `FINEST_RATE`, without facets that a sensor shows."""
     error = _deviation(cage, shading) * pixels_of_copies(cage.positions, to_world, outline, near_clip)
     # Twice the rate has a quarter of the distance.
     segments = np.ceil(np.sqrt(np.minimum(error / ERRORS[shading], FINEST_RATE**2)))
     return np.maximum(1, segments.astype(np.int64))
 
 
-def highest_rate(
-    segments: NDArray[np.integer],  # (n,) int: rate that each cage needs
-    corners: NDArray[np.integer],  # (n,) int: corners of its faces
-) -> int:
-    """Largest rate, up to `FINEST_RATE`, with at most `MOST_TRIANGLES` of all cages."""
+def highest_rate(segments: NDArray[np.integer], corners: NDArray[np.integer]) -> int:
+    """Largest rate, up to `FINEST_RATE`, with at most `MOST_TRIANGLES` of all cages.
+
+    Each cage needs a rate in ``segments`` (n,), and its faces have ``corners`` (n,).
+    """
     # A quadrilateral has four corners, and two triangles for each square of the rate.
     triangles = (np.minimum(segments, np.arange(2, FINEST_RATE + 1)[:, None]) ** 2 * corners).sum(axis=1) // 2
     return 1 + int(np.searchsorted(triangles, MOST_TRIANGLES, side="right"))
@@ -83,14 +79,11 @@ def outline_for(sensor: SceneNode) -> SceneNode:
     return pixel_error_for(mi.load_dict(sensor), ERRORS["exact"], outline=True)
 
 
-def triangles_for(
-    segments: int,  # Needed rate
-    corners: int,  # Corners of the faces of its cage
-    most: int,  # Highest uniform rate
-    outline: SceneNode,  # See `outline_for`
-    highest: int,  # Highest adaptive rate
-) -> SceneNode:
-    """Parameters of a shape with exact shading in a still picture: adaptive, unless uniform triangles are few."""
+def triangles_for(segments: int, corners: int, most: int, outline: SceneNode, highest: int) -> SceneNode:
+    """Parameters of a shape with exact shading in a still picture: adaptive, unless uniform triangles are few.
+
+    The cage needs a rate of ``segments``; ``most`` is the highest uniform rate, ``highest`` the highest adaptive one.
+    """
     is_enough = segments <= most and segments**2 * corners <= 2 * FEW_TRIANGLES
     if is_enough or min(segments, highest) == 1:
         return {"tessellation_rate": min(segments, most)}
@@ -194,10 +187,8 @@ def require_denoiser() -> None:
     try:
         import mitsuba_oidn  # noqa: F401 - only to find out whether it is there
     except ImportError as error:
-        raise ValueError(
-            f"the package {error.name}, which denoises pictures by Open Image Denoise, is missing; pip install "
-            '"mitsuba-subdivision[denoise]"'
-        ) from None
+        what = f"the package {error.name}, which denoises pictures by Open Image Denoise, is missing"
+        raise ValueError(f'{what}; pip install "mitsuba-subdivision[denoise]"') from None
 
 
 def render_denoised(

@@ -16,8 +16,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cage import CageError, ControlCage, without_warnings
-from ..cage.contents import RULES, CageContents
+from ..cage import RULES, CageContents, CageError, ControlCage, without_warnings
 from ..files import ply, usd_stage
 from ..files.formats import write_file
 from ..shapes.parameters import is_attribute_parameter, ranges_as_text, read_attributes
@@ -113,11 +112,9 @@ def _short(value: float) -> str:
 
 
 class _SceneParts:
-    def __init__(
-        self,
-        path: Path,  # Of the scene's XML file. Data of the entry NAME become `SCENE_NAME` with a suffix.
-        inputs: Iterable[Path],  # Files that must not be overwritten
-    ) -> None:
+    """Files beside a scene's XML file: data of the entry NAME become `SCENE_NAME` with a suffix. None is an input."""
+
+    def __init__(self, path: Path, inputs: Iterable[Path]) -> None:
         self._path, self._inputs = path, list(inputs)
         self._writers: dict[Path, Callable[[Path], None]] = {}
         self._pictures: dict[str, Path] = {}
@@ -215,16 +212,12 @@ def _suffix_for(name: str, contents: CageContents) -> str:
         return ".ply"
     first = next(iter(data))
     if not importlib.util.find_spec("pxr"):
-        raise CageError(
-            f'"{first}" of "{name}" cannot be written to an OBJ file; expected the package usd-core, to save '
-            'it as USD: pip install "mitsuba-subdivision[files]"'
-        )
+        expected = 'the package usd-core, to save it as USD: pip install "mitsuba-subdivision[files]"'
+        raise CageError(f'"{first}" of "{name}" cannot be written to an OBJ file; expected {expected}')
     for key in contents.attributes:
         if not usd_stage.is_possible(key) or key in usd_stage.TEXCOORDS:
-            raise CageError(
-                f'attribute "{key}" of "{name}" cannot be written to a file; expected a name of letters, digits and '
-                f'"_" other than {", ".join(usd_stage.TEXCOORDS)}'
-            )
+            expected = f'a name of letters, digits and "_" other than {", ".join(usd_stage.TEXCOORDS)}'
+            raise CageError(f'attribute "{key}" of "{name}" cannot be written to a file; expected {expected}')
     return ".usda"
 
 

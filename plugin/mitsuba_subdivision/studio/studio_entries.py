@@ -13,8 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..cage import ControlCage
-from ..cage.errors import CageSource, in_digits, warn
+from ..cage import CageSource, ControlCage, in_digits, warn
 from ..evaluation.equations import times_matrix
 from ..mitsuba_mesh import box_corners
 from ..shapes.foreground import FOREGROUND
@@ -120,10 +119,8 @@ def studio(
     low, high = np.sort(box @ axes, axis=0)
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low) / 2)
     if not SIZES[0] < 2 * radius < SIZES[1]:
-        warn(
-            f"{prefix}a model {in_digits(2 * radius)} units large; expected {SIZES[0]:g} to {SIZES[1]:g}, beyond which "
-            "Mitsuba's single precision loses light and surfaces"
-        )
+        expected = f"{SIZES[0]:g} to {SIZES[1]:g}, beyond which Mitsuba's single precision loses light and surfaces"
+        warn(f"{prefix}a model {in_digits(2 * radius)} units large; expected {expected}")
     origin, distance = framed(times_matrix(in_world[None], axes)[0], azimuth, elevation, size)
     right, up_in_picture, forward = (axes @ camera_axes(azimuth, elevation)).T
     from_below = elevation < 0
@@ -151,8 +148,7 @@ def studio(
     scene["ambient_light"] = {"type": "constant", "radiance": _rgb(AMBIENT), "sampling_weight": 0.6}
     if not from_below:
         # The camera stands on the floor and sees neither its sides nor the top of the wall, at any distance.
-        extent = distance + WALL * radius
-        sweep = _backdrop(1.5 * extent, BEND * radius, WALL * radius, 2 * WALL * radius + extent, 2 * extent)
+        sweep = _backdrop(BEND * radius, WALL * radius, distance + WALL * radius)
         scene["ground"] = {
             "type": "subdivision",
             **sweep.as_properties(mi),
@@ -191,14 +187,12 @@ def _is_glowing_mesh(entry: Any) -> bool:
 
 
 def framed(
-    points: NDArray[np.float64],  # (n, 3) float64: in the studio's axes
-    azimuth: float,
-    elevation: float,
-    size: tuple[int, int],  # (width, height)
+    points: NDArray[np.float64], azimuth: float, elevation: float, size: tuple[int, int]
 ) -> tuple[NDArray[np.float64], float]:
     """Place a camera so that points fill its image, centred, up to `MARGIN`; models deeper than wide are smaller.
 
-    Returns its place in the studio's axes, and its distance from the middle of the points, along the view.
+    Returns its place, like the points ``(n, 3)`` in the studio's axes, and its distance from their middle, along the
+    view.
     """
     axes = camera_axes(azimuth, elevation)
     in_camera = times_matrix(points[None], axes)[0]
@@ -306,20 +300,16 @@ def _checked_bounds(bounds: ArrayLike, prefix: str) -> NDArray[np.float64]:
     return box
 
 
-def _backdrop(
-    front: float,  # Extent of the floor towards -y; more than `wall - 2 * bend`
-    # y of the floor's bend, and of the upright wall, which begins at the height `wall - bend`
-    bend: float,
-    wall: float,
-    height: float,  # Of the wall; more than `2 * (wall - bend)`
-    half_width: float,
-) -> ControlCage:
-    """Cage of a sweep across the x axis: the floor is z = 0, and the wall rises towards +y."""
+def _backdrop(bend: float, wall: float, extent: float) -> ControlCage:
+    """Cage of a sweep across the x axis: a floor at z = 0 that bends at a y, and rises to an upright wall at another.
+
+    The wall begins at the height ``wall - bend``; floor and wall reach further than the extent on all sides.
+    """
     # A cubic spline is straight along four collinear control points.
     step = wall - bend
-    floor = [[-front, 0], [bend - step, 0], [bend, 0]]
-    profile = np.array([*floor, [wall, 0], [wall, step], [wall, 2 * step], [wall, height]])
-    positions = np.concatenate([np.insert(profile, 0, x, axis=1) for x in (-half_width, half_width)])
+    floor = [[-1.5 * extent, 0], [bend - step, 0], [bend, 0]]
+    profile = np.array([*floor, [wall, 0], [wall, step], [wall, 2 * step], [wall, 2 * wall + extent]])
+    positions = np.concatenate([np.insert(profile, 0, x, axis=1) for x in (-2 * extent, 2 * extent)])
     left = np.arange(len(profile) - 1)
     right = left + len(profile)
     return ControlCage(positions, np.stack([left, right, right + 1, left + 1], axis=1), source=CageSource("backdrop"))

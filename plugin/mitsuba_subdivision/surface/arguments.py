@@ -5,13 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..cage import ControlCage
-from ..cage.errors import CageError, in_digits
+from ..cage import CageError, ControlCage, in_digits
 from ..evaluation.equations import EVALUATORS, Evaluator
 from ..mesh.connectivity import VertexRule
 from ..patches.patch_table import PatchTable
-from ..schemes.domain import FloatArray
-from ..schemes.scheme import Scheme
+from ..schemes import FloatArray, Scheme
 
 DOMAIN_TOLERANCE = 1e-12  # Distance by which rounding may put a parameter outside its domain
 # Most faces around a vertex, and most corners of a face, as in OpenSubdiv. Eigenbases of such one-rings take 3 seconds.

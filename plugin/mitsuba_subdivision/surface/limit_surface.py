@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numbers
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, partial
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..cage import ControlCage
-from ..cage.contents import TEXCOORDS, attributes_by_name
-from ..cage.errors import CageError
+from ..cage import TEXCOORDS, CageError, ControlCage, attributes_by_name
 from ..evaluation.element import SurfaceSamples, derivative_stencils
 from ..evaluation.equations import AT_EXTRAORDINARY_POINT, Evaluator
 from ..evaluation.located_samples import limit_stencils
@@ -26,8 +26,7 @@ from ..patches.patch_table import PatchTable
 from ..patches.piece_table import PieceTable
 from ..patches.polynomial_pieces import ElementBounds, SurfacePieces
 from ..refinement.adapted_scheme import adapted_scheme
-from ..schemes import Scheme
-from ..schemes.domain import FloatArray
+from ..schemes import FloatArray, Scheme
 from ..tessellation.attribute_table import AttributeLayout, attribute_table
 from ..tessellation.uniform import uniform_table
 from ..tessellation.vertex_table import Tessellation, VertexMatrices, VertexTable
@@ -35,9 +34,6 @@ from ..variants import variant_name
 from .arguments import checked_elements, checked_form, checked_samples, require_derivatives, require_valences
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from types import ModuleType
-
     from scipy import sparse
 
     from ..kernels.surface_kernel import SurfaceKernel
@@ -246,12 +242,8 @@ class LimitSurface:
         """Area of the surface, in squared units of the cage's space.
 
         Computed by Gauss quadrature of every polynomial piece, at all levels around extraordinary points, to a relative
-        accuracy of 1e-12; where it is folded along a curve inside an element, to about 1e-8 of the pieces there.
-
-        Raises
-        ------
-        SchemeError
-            As `bounds`.
+        accuracy of 1e-12; where it is folded along a curve inside an element, to about 1e-8 of the pieces there. Raises
+        SchemeError as `bounds`.
         """
         areas, rest = self._areas
         return float(sum(part_areas.sum() for part_areas in areas) + rest)
@@ -551,9 +543,8 @@ class LimitSurface:
         if not isinstance(sample_offset, numbers.Real) or not 0 <= sample_offset < 1:
             raise ValueError(f"sample_offset {sample_offset!r}; expected at least 0 and below 1")
         if sample_offset == 0 and evaluator in ("power", "stam"):
-            raise ValueError(
-                f'evaluator "{evaluator}" has no value at extraordinary points; expected a sample_offset above 0'
-            )
+            problem = f'evaluator "{evaluator}" has no value at extraordinary points'
+            raise ValueError(f"{problem}; expected a sample_offset above 0")
         if evaluator == "stabilized" and sample_offset == 0 and dtype == np.float64:
             return table.apply(self.cage.positions)
         half_edge, uv = table.locations()

@@ -22,20 +22,9 @@ from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray
 from ..messages import counted
 from ..patches.patch_table import PatchTable
-from ..schemes.domain import FloatArray
-from ..schemes.scheme import Scheme
+from ..schemes import FloatArray, Scheme
 from . import HIGHEST_RATE
-from .adaptive_grid import (
-    DEEPEST,
-    AdaptiveGrid,
-    PatchFrames,
-    Tiles,
-    child,
-    in_patch,
-    sides_of,
-    tile_type,
-    whole_patches,
-)
+from .adaptive_grid import DEEPEST, AdaptiveGrid, PatchFrames, Tiles, child, in_patch, sides_of, whole_patches
 from .criterion import Cone, Criterion, cone_around, dot, least_product, normal_cone, rounded_up, tangent_cone, unit
 from .memory import require_memory_for_triangles
 from .uniform import checked_rate
@@ -75,7 +64,7 @@ def adaptive_table(
         raise ValueError(f"max_rate {max_rate}; expected at most {HIGHEST_RATE} segments per edge")
     frames, points = PatchFrames.of(patches), control_points[patches.control_of_vertex]
     rates = TileRates(patches.scheme, frames, criterion, max_rate)
-    none = np.empty(0, dtype=tile_type(patches.scheme.domain.corner_count))
+    none = whole_patches(np.arange(0), patches.scheme.domain.corner_count)
     needed = np.concatenate([none, *_divided(rates, _whole_patches(patches, rates, points))])
     u, v = needed["origin"].T
     needed = needed[np.lexsort((needed["is_flipped"], u, v, needed["depth"], needed["corner"]))]
@@ -214,8 +203,7 @@ class TileRates:
 
     def most(self, tiles: Tiles) -> IntArray:
         """``(t,)`` highest rates that tiles may have, which are powers of two, as on sides."""
-        rates: IntArray = np.maximum(1, (1 << self.max_rate.bit_length() - 1) >> tiles["halvings"])
-        return rates
+        return np.maximum(1, (1 << self.max_rate.bit_length() - 1) >> tiles["halvings"])
 
     def triangle_counts(self, tiles: Tiles) -> IntArray:
         """``(t,)`` triangles of tiles with clipped rates, without those that higher rates of neighbours add."""
@@ -350,8 +338,7 @@ def _extent(hull: FloatArray | None, values: FloatArray, axes: Iterable[FloatArr
     """``(t,)`` sizes of hulls of tiles along orthogonal axes ``(3, t)``; infinite for unknown hulls."""
     if hull is None:
         return np.full(values.shape[2], np.inf)
-    extent: FloatArray = np.linalg.norm([np.ptp(times(hull, dot(values, axis)), axis=0) for axis in axes], axis=0)
-    return extent
+    return np.linalg.norm([np.ptp(times(hull, dot(values, axis)), axis=0) for axis in axes], axis=0)
 
 
 def _normals(kind: DividedTile, values: FloatArray, axis: FloatArray) -> Cone:
@@ -370,8 +357,7 @@ def _are_folded(kind: DividedTile, ring: FloatArray, axis: FloatArray) -> NDArra
         return np.ones(axis.shape[1], dtype=bool)
     (a, c, b, d), (x, y) = kind.control_faces, (dot(ring, along) for along in _normals_to(axis))
     areas = (x[c] - x[a]) * (y[d] - y[b]) - (y[c] - y[a]) * (x[d] - x[b])
-    are_folded: NDArray[np.bool_] = areas.min(axis=0) < -FOLDED * areas.max(axis=0)
-    return are_folded
+    return areas.min(axis=0) < -FOLDED * areas.max(axis=0)
 
 
 def _normals_to(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -384,10 +370,7 @@ def _normals_to(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def feature_edges(
-    patches: PatchTable,
-    frames: PatchFrames,
-    points: FloatArray,  # (n_v, 3) float64: control points at the vertices of the mesh
-    criterion: Criterion,
+    patches: PatchTable, frames: PatchFrames, points: FloatArray, criterion: Criterion
 ) -> NDArray[np.bool_]:
     """``(n_h,)`` whether the curve along each half-edge must itself hold to the limit.
 

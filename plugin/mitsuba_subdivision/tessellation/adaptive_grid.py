@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
-from ..mesh.ragged import chunks_of
 from ..patches.patch_table import PatchTable
 from ..schemes.domain import FloatArray, ParameterDomain
 from .stitching import inner_counts, inner_steps, stitched
@@ -297,7 +296,7 @@ class AdaptiveGrid:
         counts_of_tiles = self.side_counts.sum(axis=1), self._inner_counts, self._triangle_counts
         on_sides, inside, begin = map(ragged.offsets, counts_of_tiles)
         triangles = np.empty((int(begin[-1]), 3), dtype=np.int32)
-        for block in chunks_of(len(self.tiles), self.side_counts.shape[1]):
+        for block in ragged.chunks_of(len(self.tiles), self.side_counts.shape[1]):
             samples = slice(on_sides[block.start], on_sides[block.stop])
             rates, counts = self.tiles["rates"][block], self.side_counts[block]
             of_block = stitched(rates, counts, self._along(samples), self.keeps_corner[block])

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh.connectivity import IntArray
+from ..mesh.cuts import cut_along_seams
 from ..mesh.shared import Content, shared, shared_by_key
 from ..patches.patch_table import PatchTable
 from ..schemes.domain import FloatArray
@@ -22,14 +23,9 @@ if TYPE_CHECKING:
 
 
 class AttributeLayout:
-    """Triangles and vertex locations of a tessellation with attributes, independent of the attributes' values."""
+    """Triangles and vertex locations of a tessellation of patches with attributes, whatever the attributes' values."""
 
-    def __init__(
-        self,
-        table: VertexTable,
-        patches: PatchTable,  # That the table was built from
-        layouts: tuple[ChannelLayout, ...],
-    ) -> None:
+    def __init__(self, table: VertexTable, patches: PatchTable, layouts: tuple[ChannelLayout, ...]) -> None:
         self._table, self._patches, self._grid = table, patches, table.grid
         # (n,) int64 or None: the vertex of the `VertexTable` whose position and normal each split vertex has. None
         # without seams, when both tables have the same vertices.
@@ -37,8 +33,6 @@ class AttributeLayout:
         # Tables of the meshes of channels, and the vertex there of each split vertex
         self._tables: dict[ChannelLayout, tuple[VertexTable, IntArray]] = {}
         if seams := [layout.seam for layout in layouts if layout.seam is not None]:
-            from ..mesh.cuts import cut_along_seams
-
             # Only elements that are faces have seams. Cutting them along seams keeps their half-edges.
             cut = cut_along_seams(patches.topology, np.any(seams, axis=0))
             self._grid = table.grid.cut(PatchTable(cut.topology, patches.scheme, patches.is_hole).elements)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .uniform_grid import UniformGrid
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from ..patches.patch_table import PatchTable
 
 # Measured peak memory of a uniform tessellation, in bytes: of a vertex, with its point, normal and two triangles, and
@@ -46,9 +45,10 @@ def require_memory(patches: PatchTable, grid: UniformGrid) -> None:
         return bytes_of_tessellation(patches, UniformGrid(grid.domain, grid.topology, rate))
 
     fits = bisect_right(range(1, grid.rate), available, key=needed_at)
+    expected = f"expected at most {fits}" if fits else "not even a rate of 1 fits"
     raise MemoryError(
         f"tessellation rate {grid.rate} needs about {needed / 1e9:.3g} GB, and {available / 1e9:.3g} GB are available; "
-        + (f"expected at most {fits}" if fits else "not even a rate of 1 fits")
+        f"{expected}"
     )
 
 
@@ -71,13 +71,11 @@ def exceeded_limit(needed: float) -> int | None:
     return None if limit is None or needed <= limit else limit
 
 
-def available_memory(
-    root: str | Path = "/",  # Parent of the folders `proc` and `sys`
-) -> int | None:
-    """Bytes that the machine, the process's control groups and its own limit leave; None if that is not reported."""
-    from pathlib import Path
+def available_memory(root: Path = Path("/")) -> int | None:
+    """Bytes that the machine, the process's control groups and its own limit leave; None if that is not reported.
 
-    root = Path(root)
+    The folders `proc` and `sys` are in ``root``.
+    """
     machine = [line.split()[1] for line in _lines(root / "proc/meminfo") if line.startswith("MemAvailable:")]
     left = [*(1024 * int(kilobytes) for kilobytes in machine), *_of_groups(root), *_of_process(root)]
     return min((max(count, 0) for count in left), default=None)
@@ -125,6 +123,5 @@ def _lines(path: Path) -> list[str]:
 
 
 def _number(path: Path) -> int | None:
-    """The number in a file; None if there is no such file, or if it contains no number."""
     lines = _lines(path)
     return int(lines[0]) if lines and lines[0].isdigit() else None

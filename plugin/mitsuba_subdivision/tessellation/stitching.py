@@ -25,14 +25,12 @@ Triangles = list[tuple[IntArray, IntArray]]
 
 
 class SideSamples:
-    """Samples along the sides of tiles."""
+    """Samples along the sides of tiles: as many as segments, ``(t, m)``, as the last point belongs to the next side.
 
-    def __init__(
-        self,
-        # (t, m): segments on each side. There are as many samples, as the last point belongs to the next side.
-        counts: IntArray,
-        along: FloatArray,  # (n,) float64: position of each sample along its side, in [0, 1)
-    ) -> None:
+    The position of each sample along its side, ``(n,)``, is in [0, 1).
+    """
+
+    def __init__(self, counts: IntArray, along: FloatArray) -> None:
         self.counts, self.along = counts, along
         # First sample of each side, and tile and side of each sample.
         self.first = ragged.starts(counts.ravel()).reshape(counts.shape)

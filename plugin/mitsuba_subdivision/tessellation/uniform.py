@@ -8,8 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..mesh import ragged
-from ..mesh.connectivity import IntArray
+from ..mesh import IntArray, ragged
 from ..mesh.shared import shared
 from ..patches.patch_table import PatchClass, PatchTable
 from ..schemes.domain import FloatArray
@@ -33,10 +32,8 @@ def uniform_table(patches: PatchTable, rate: int) -> VertexTable:
 def _table(patches: PatchTable, rate: int) -> VertexTable:
     grid = UniformGrid(patches.scheme.domain, patches.elements, rate)
     if grid.vertex_count > MOST_VERTICES:
-        raise ValueError(
-            f"tessellation rate {rate} makes {grid.vertex_count} vertices; expected at most {MOST_VERTICES}, whose "
-            "triangles fit into a buffer"
-        )
+        expected = f"at most {MOST_VERTICES}, whose triangles fit into a buffer"
+        raise ValueError(f"tessellation rate {rate} makes {grid.vertex_count} vertices; expected {expected}")
     require_memory(patches, grid)
     polynomials, (controls, refinement) = _polynomials(patches, grid), patches.control_rows()
     counts = patches.control_count, patches.patch_count

@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..mesh import ragged
-from ..mesh.connectivity import IntArray, Topology
+from ..mesh import IntArray, Topology, ragged
 from ..schemes.domain import FloatArray, ParameterDomain
 
 # Vertices per slice when computing triangles, so that arrays stay in a core's cache.
@@ -39,19 +38,14 @@ class GridPart(NamedTuple):
 class UniformGrid:
     """Numbering of a uniform tessellation: the same for all surfaces over the same elements.
 
-    An element that fits the domain is one grid with ``rate`` segments along each side. Any other polygon has a square
-    grid at each of its corners, which reaches half way along the corner's two edges. For an even rate, these grids meet
-    along spokes, which run from the midpoints of the edges to the polygon's centre. For an odd rate, strips of
-    triangles join them, and a fan of triangles closes the middle. `AdaptiveGrid` has the same members.
+    Each face of the topology that has corners is an element, each half-edge the corner at which it begins. An element
+    that fits the domain is one grid with ``rate`` segments along each side. Any other polygon has a square grid at each
+    of its corners, which reaches half way along the corner's two edges. For an even rate, these grids meet along
+    spokes, which run from the midpoints of the edges to the polygon's centre. For an odd rate, strips of triangles join
+    them, and a fan of triangles closes the middle. `AdaptiveGrid` has the same members.
     """
 
-    def __init__(
-        self,
-        domain: ParameterDomain,
-        # Of the elements: each face with corners is an element, each half-edge the corner at which it begins
-        topology: Topology,
-        rate: int,  # Segments on every edge
-    ) -> None:
+    def __init__(self, domain: ParameterDomain, topology: Topology, rate: int) -> None:
         self.domain, self.topology, self.rate = domain, topology, rate
         self._is_whole = topology.face_sizes == domain.corner_count
         self._corner_count = int(np.count_nonzero(topology.vertex_half_edge >= 0))
@@ -274,12 +268,8 @@ class UniformGrid:
             corners = t.next[corners]
         return uv, parts
 
-    def _side_parts(
-        self,
-        corners: IntArray,  # (p,): corners at which the edges of patches begin
-        samples: IntArray,  # samples of a patch from these corners along the edges
-        along: FloatArray,  # parameters of these samples along the edge
-    ) -> list[GridPart]:
+    def _side_parts(self, corners: IntArray, samples: IntArray, along: FloatArray) -> list[GridPart]:
+        """Parts of samples on the edges that begin at corners ``(p,)``, at parameters ``along`` the edges."""
         uv, steps = np.stack([along, np.zeros_like(along)], axis=1), np.arange(len(samples))
         at_edge = np.flatnonzero(self._are_lowest(corners))
         at_vertex = np.flatnonzero(self.topology.vertex_half_edge[self.topology.face_vertices[corners]] == corners)

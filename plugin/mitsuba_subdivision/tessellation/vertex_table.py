@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -17,12 +18,9 @@ from ..evaluation.polynomials import monomial_values, polynomial_basis
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray
 from ..patches.patch_table import PatchClass
-from ..schemes.domain import FloatArray
-from ..schemes.scheme import Scheme
+from ..schemes import FloatArray, Scheme
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from scipy import sparse
 
     from .adaptive_grid import AdaptiveGrid
@@ -322,6 +320,6 @@ class Tessellation:
         OSError
             If the file cannot be written; an existing one is then unchanged.
         """
-        from ..files.formats import write_triangles
+        from ..files.formats import Triangles, write_triangles
 
-        write_triangles(path, self.positions, self.normals, self.triangles, self.texcoords, self.attributes)
+        write_triangles(path, Triangles(self.positions, self.normals, self.triangles, self.texcoords, self.attributes))
