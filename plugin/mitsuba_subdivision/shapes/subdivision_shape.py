@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..device_arrays import mapped
 from ..kernels.array_types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Vector2, Vector3
 from ..llvm import require_llvm
+from ..mesh.shared import forget
 from ..surface import TEXCOORDS
 from ..variants import Variant
 from .cage_attributes import PREFIX, WIDTHS, CageAttributes, mesh_attributes, mesh_name
@@ -138,8 +139,10 @@ def make_subdivision(
             for values in [channel.values for channel in channels.values()] + ([on_device.values] if on_device else []):
                 values.settle()
             # Kernels have their tables; updates compute the rest again.
+            table, layout = triangles.table, triangles.layout
+            forget(surface.cage.topology, table, table.grid, layout)
             for patches in {surface.patches, *(surface.channel(name).layout.patches for name in channels)}:
-                patches.forget()
+                forget(patches, patches.topology, patches.elements)
 
         def _triangles(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> Triangles:
             parameters, surface = self._parameters, self._parameters.surface

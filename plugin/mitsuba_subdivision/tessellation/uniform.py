@@ -38,9 +38,7 @@ def _table(patches: PatchTable, rate: int) -> VertexTable:
             "triangles fit into a buffer"
         )
     require_memory(patches, grid)
-    polynomials, (controls, refinement) = _polynomials(patches, grid), patches.control_rows()
-    counts = patches.control_count, patches.patch_count
-    return VertexTable(*counts, grid, polynomials, controls, _copies(patches, grid), refinement)
+    return VertexTable(patches, patches.patch_count, grid, _polynomials(patches, grid), _copies(patches, grid))
 
 
 def checked_rate(rate: int, name: str = "tessellation rate") -> int:
