@@ -17,7 +17,7 @@ from ..evaluation.patch_tree import PatchTree, patch_trees
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.one_ring import RingTable, one_rings
-from ..mesh.shared import Content, shared_by_key
+from ..mesh.shared import Content, forget, shared_by_key
 from ..mesh.signature import Signature, fan_codes, row_codes, signatures_at
 from ..schemes.domain import FloatArray
 from ..schemes.scheme import Scheme, StencilTable
@@ -119,6 +119,10 @@ class PatchTable:
         """The one-rings of all patches, class by class."""
         half_edges = self.half_edge_of_corner[self._patch_codes[0][self._order[0]]]
         return RingTable(self.topology, one_rings(self._signatures), half_edges, self.patch_counts)
+
+    def forget(self) -> None:
+        """Drop data that are computed again on demand, for a mesh that only its kernels evaluate."""
+        forget(self, self.topology, self.elements)
 
     @property
     def patch_count(self) -> int:

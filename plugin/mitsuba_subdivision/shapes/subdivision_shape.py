@@ -85,13 +85,7 @@ def make_subdivision(
 
             recentres, placed = parameters.evaluator == "stabilized", (self.to_world, parameters.to_world)
             self._placement = Placement(surface.cage.positions, kind, *placed, recentres=recentres)
-            # The surface of hits and of displaced normals, and the attributes that are evaluated at hits
-            on_device: SurfaceKernel | None = None
-            if is_exact or (is_jit and parameters.displacement is not None):
-                from ..kernels.surface_kernel import SurfaceKernel
-
-                on_device = SurfaceKernel(surface.pieces(), variant.Float)
-                on_device.values.load(self._placement.positions)
+            # The attributes that are evaluated at hits, and the surface of hits and of displaced normals
             channels: dict[str, ChannelKernel] = {}
             if is_exact and surface.attribute_names:
                 from ..kernels.channel_kernel import ChannelKernel
@@ -100,6 +94,14 @@ def make_subdivision(
                     channel = surface.channel(name)
                     if name == TEXCOORDS or channel.values.shape[1] in WIDTHS:
                         channels[name] = ChannelKernel(channel, variant.Float)
+                        if channel.layout.patches is not surface.patches:
+                            channel.layout.patches.forget()
+            on_device: SurfaceKernel | None = None
+            if is_exact or (is_jit and parameters.displacement is not None):
+                from ..kernels.surface_kernel import SurfaceKernel
+
+                on_device = SurfaceKernel(surface.pieces(), variant.Float)
+                on_device.values.load(self._placement.positions)
             self._displacement: ShapeDisplacement | None = None
             if parameters.displacement is not None:
                 from .displacement import ShapeDisplacement
@@ -139,10 +141,8 @@ def make_subdivision(
             for values in [channel.values for channel in channels.values()] + ([on_device.values] if on_device else []):
                 values.settle()
             # Kernels have their tables; updates compute the rest again.
-            table, layout = triangles.table, triangles.layout
-            forget(surface.cage.topology, table, table.grid, layout)
-            for patches in {surface.patches, *(surface.channel(name).layout.patches for name in channels)}:
-                forget(patches, patches.topology, patches.elements)
+            surface.patches.forget()
+            forget(surface.cage.topology, triangles.table, triangles.layout)
 
         def _triangles(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> Triangles:
             parameters, surface = self._parameters, self._parameters.surface
