@@ -41,10 +41,10 @@ class VertexKernel:
     """
 
     def __init__(self, table: VertexTable, float_type: type) -> None:
-        self.vertex_count, self.control_count = table.vertex_count, table.control_count
+        self.vertex_count, self.control_count = table.vertex_count, table.patches.control_count
         self._types = types = ArrayTypes(float_type)
         controls, refinement = table.patches.control_rows()
-        self._refined_count = table.control_count if refinement is None else refinement.row_count
+        self._refined_count = self.control_count if refinement is None else refinement.row_count
         self._refinement = None if refinement is None else shared(SparseMatrix, refinement, float_type)
         indices, are_rounded = types.indices(controls), refinement is not None
         self._parts = [_Part(types, part, indices, are_rounded) for part in table.polynomials]

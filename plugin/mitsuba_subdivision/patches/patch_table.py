@@ -67,7 +67,8 @@ class PatchTable:
         # elements, become faces without corners.
         self.elements = topology
         # Half-edges of the mesh that are half-edges of the elements
-        t, self._half_edges = topology, slice(None)
+        self._half_edges: IndexArray | slice = slice(None)
+        t = topology
         if scheme.element == "vertex":
             offsets, half_edges = t.vertex_fans
             # A dual edge crosses the cage's edge that two successive faces about a vertex share.

@@ -48,10 +48,6 @@ class VertexTable:
     copies: IntArray
 
     @property
-    def control_count(self) -> int:
-        return self.patches.control_count
-
-    @property
     def vertex_count(self) -> int:
         return self.grid.vertex_count
 
