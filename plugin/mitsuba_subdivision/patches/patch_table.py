@@ -75,10 +75,9 @@ class PatchTable:
             self.elements = Topology(t.face_count, np.diff(offsets), t.face[half_edges], t.edge[t.prev[half_edges]])
             self._half_edges = half_edges
         elif is_hole is not None and is_hole.any():
-            kept = t.half_edges_of(~is_hole).astype(np.int32)
+            self._half_edges = kept = t.half_edges_of(~is_hole).astype(np.int32)
             sizes = np.where(is_hole, 0, t.face_sizes)
             self.elements = Topology(t.vertex_count, sizes, t.face_vertices[kept], t.edge[kept])
-            self._half_edges = kept
 
     @cached_property
     def half_edge_of_corner(self) -> IndexArray:

@@ -94,7 +94,8 @@ def make_subdivision(
                     channel = surface.channel(name)
                     if name == TEXCOORDS or channel.values.shape[1] in WIDTHS:
                         channels[name] = ChannelKernel(channel, variant.Float)
-                        if channel.layout.patches is not surface.patches:
+                        # Their tables take the most memory, and only attributes at vertices need them again.
+                        if not self._at_vertices and channel.layout.patches is not surface.patches:
                             channel.layout.patches.forget()
             on_device: SurfaceKernel | None = None
             if is_exact or (is_jit and parameters.displacement is not None):
@@ -141,7 +142,8 @@ def make_subdivision(
             for values in [channel.values for channel in channels.values()] + ([on_device.values] if on_device else []):
                 values.settle()
             # Kernels have their tables; updates compute the rest again.
-            surface.patches.forget()
+            for patches in {surface.patches, *(surface.channel(name).layout.patches for name in channels)}:
+                patches.forget()
             forget(surface.cage.topology, triangles.table, triangles.layout)
 
         def _triangles(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> Triangles:
