@@ -151,7 +151,7 @@ def test_folds_of_a_refined_cage_have_no_normal(make, monkeypatch):
     cage = make(6, 0.3)
     refine_first(monkeypatch)
     normals, table = normals_on_every_path(cage)
-    assert table.refinement is not None
+    assert table.patches.refined is not None
     np.testing.assert_array_equal(assert_unit_or_zero_alike(normals), is_on_rim(table))
     for distance in (0, 1):
         points = np.outer(1 / 3 + distance * np.arange(cage.vertex_count), SHIFT)

@@ -104,7 +104,7 @@ def test_classes_share_kernels_for_any_alignment_of_arrays(surface, float_type):
     (hashes,) = compiled
     # One packs the control points; one each for vertices on planes and on polynomials of the scheme. Others refine
     # control points and weld copies of vertices, where there are any.
-    assert len(hashes) == 1 + len(table.polynomials) + (table.refinement is not None) + bool(table.copies.size)
+    assert len(hashes) == 1 + len(table.polynomials) + (table.patches.refined is not None) + bool(table.copies.size)
 
 
 def test_missing_points_are_an_error(float_type):

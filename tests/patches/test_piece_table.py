@@ -46,16 +46,16 @@ def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkey
     refine_first(monkeypatch)
     cage = tagged(mixed_torus(), creases=[(0, 8, INFINITE), (8, 16, INFINITE)])
     surface = LimitSurface(bumpy(cage))
-    table, (refined, matrix) = surface.pieces(), surface.patches.refined
+    table, (refined, stencils) = surface.pieces(), surface.patches.refined
     controls, refinement = surface.patches.control_rows()
     assert surface.patches.topology.vertex_count > cage.vertex_count
-    assert refinement.shape == (refined.topology.vertex_count, cage.vertex_count)
-    np.testing.assert_allclose(refinement.sum(axis=1), 1, rtol=0, atol=ROUNDING)
+    assert (refinement.row_count, refinement.column_count) == (refined.topology.vertex_count, cage.vertex_count)
+    np.testing.assert_allclose(refinement.matrix.sum(axis=1), 1, rtol=0, atol=ROUNDING)
     positions = surface.cage.positions
-    expected = matrix @ positions[surface.cage.cut_mesh.vertex]
-    np.testing.assert_allclose(refinement @ positions, expected, rtol=0, atol=ROUNDING)
+    expected = stencils.matrix @ positions[surface.cage.cut_mesh.vertex]
+    np.testing.assert_allclose(refinement.matrix @ positions, expected, rtol=0, atol=ROUNDING)
     np.testing.assert_array_equal(controls, refined.controls)
-    assert surface.sampling(1).refinement is refinement
+    assert surface.patches.control_rows()[1] is refinement
     # The patch at a half-edge is the refined face there.
     corners = np.concatenate([group.corners for group in refined.classes])
     for half_edge, code in enumerate(table.half_edges[:, layout.CODE]):

@@ -60,20 +60,23 @@ def replayed(method: Callable[..., Any]) -> Callable[..., Any]:
     """Decorate a method to record its kernels, and to run these again without tracing, which takes far longer.
 
     For methods of arrays without derivatives, whose results depend on nothing else but the arrays of the object. A
-    method that is called within another one, within a frozen function, or outside the main thread, is traced.
+    method that is called within another one, within a frozen function, or outside the main thread, is traced. So is the
+    first call of an object: at loading it is the only one, and recording takes longer than tracing.
     """
 
     @wraps(method)
     def call(self: Any, *arguments: Any) -> Any:
         is_main = threading.current_thread() is threading.main_thread()
-        if not is_main or dr.flag(dr.JitFlag.FreezingScope) or not _replaying.acquire(blocking=False):
+        recordings = vars(self).setdefault("_recordings", {})
+        is_traced = method not in recordings or not is_main or dr.flag(dr.JitFlag.FreezingScope)
+        if is_traced or not _replaying.acquire(blocking=False):
+            recordings.setdefault(method)
             return method(self, *arguments)
         was_enabled = gc.isenabled()
         try:
             # Freeing a scene while a function is recorded ends the process.
             gc.disable()
-            recordings = vars(self).setdefault("_recordings", {})
-            if method not in recordings:
+            if recordings[method] is None:
                 # Without a reference cycle: objects that the collector frees may end the process later.
                 this = ref(self)
                 recording = dr.freeze(lambda _, *arguments: method(this(), *arguments))

@@ -22,6 +22,7 @@ from ..evaluation.polynomials import polynomial_basis
 from ..mesh import ragged
 from ..mesh.shared import Content, shared, shared_by_key
 from ..patches.piece_table import PACKET, PieceTable, piece_packets, tree_arrays
+from ..schemes import StencilTable
 from .array_types import (
     NO_CONFLICTS,
     SUMS,
@@ -72,20 +73,15 @@ class SparseMatrix:
 
     def __init__(
         self,
-        matrix: sparse.csr_array,  # (n, m) sparse array
+        matrix: sparse.csr_array | StencilTable,  # (n, m); a table is sorted by rows
         float_type: type,  # Flat Dr.Jit array of the values, such as `drjit.llvm.ad.Float`; entries have its precision
         *,
         # Whether rows sum to one. Sums are then relative to the first value of each row, which reduces rounding errors.
         is_relative: bool = True,
     ) -> None:
-        self._types, self._matrix, self._is_relative = ArrayTypes(float_type), matrix, is_relative
-        self._rows = self._uploaded(matrix)
-
-    @classmethod
-    def shared(cls, matrix: sparse.csr_array, float_type: type) -> SparseMatrix:
-        """A matrix whose rows sum to one; equal ones share the object while it is referenced."""
-        key = cls, float_type, *map(Content, (matrix.data, matrix.indices, matrix.indptr)), matrix.shape
-        return shared_by_key(key, lambda: cls(matrix, float_type))
+        self._types, self._is_relative = ArrayTypes(float_type), is_relative
+        self._table = matrix if isinstance(matrix, StencilTable) else StencilTable.from_matrix(matrix)
+        self._rows = self._uploaded(self._table)
 
     def __call__(
         self,
@@ -107,12 +103,12 @@ class SparseMatrix:
 
     @cached_property
     def transposed_rows(self) -> tuple:
-        return self._uploaded(self._matrix.T.tocsr())
+        return self._uploaded(StencilTable.from_matrix(self._table.matrix.T.tocsr()))
 
-    def _uploaded(self, matrix: sparse.csr_array) -> tuple:
+    def _uploaded(self, table: StencilTable) -> tuple:
         """Number of rows; start of each row; columns and entries."""
-        types = self._types
-        return matrix.shape[0], types.indices(matrix.indptr), types.indices(matrix.indices), types.floats(matrix.data)
+        types, starts = self._types, ragged.offsets(np.bincount(table.rows, minlength=table.row_count))
+        return table.row_count, types.indices(starts), types.indices(table.columns), types.floats(table.weights)
 
     def _product(self, rows: tuple, flat: FloatBuffer, size: int, is_relative: bool) -> FloatBuffer:
         types = self._types
@@ -249,8 +245,8 @@ class CoefficientMap:
         controls, refinement = table.patches.control_rows(table.control_of_vertex, table.control_count)
         self._piece_count, self._width = table.piece_count, len(polynomial_basis(table.patches.scheme).powers)
         # To the control points of the patches, if these are those of the cage refined once
-        self._refinement = None if refinement is None else SparseMatrix.shared(refinement, float_type)
-        self._refined_count = table.control_count if refinement is None else refinement.shape[0]
+        self._refinement = None if refinement is None else shared(SparseMatrix, refinement, float_type)
+        self._refined_count = table.control_count if refinement is None else refinement.row_count
         # Parts of patches have control points of their own, stored after all others, and so are their indices.
         point_count, parts, pieces = self._refined_count, [], []
         classes = zip(table.elements, table.classes.tolist(), strict=True)
@@ -291,7 +287,7 @@ class CoefficientMap:
             dr.scatter(padded, dr.gather(types.vector4, refined, index), index, mode=NO_CONFLICTS)
             self._parts.write(refined, padded)
         packet_count = self._piece_count * piece_packets(self._width, size)
-        coefficients: FloatBuffer = dr.zeros(types.float, PACKET * packet_count)
+        coefficients: FloatBuffer = dr.empty(types.float, PACKET * packet_count)
         if self._pieces is not None:
             self._pieces.write(padded, coefficients, size)
         return coefficients

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..evaluation.normals import LEAST_EXTENT, TANGENT_ROUNDING
 from ..mesh import ragged
+from ..mesh.shared import shared
 from ..patches.piece_table import PACKET
 from ..tessellation.vertex_table import VertexPolynomials, VertexTable
 from .algebra import AffineMap, Monomials, unit
@@ -40,13 +41,13 @@ class VertexKernel:
     """
 
     def __init__(self, table: VertexTable, float_type: type) -> None:
-        self.vertex_count, self.control_count = table.vertex_count, table.control_count
+        self.vertex_count, self.control_count = table.vertex_count, table.patches.control_count
         self._types = types = ArrayTypes(float_type)
-        refinement = table.refinement
-        self._refined_count = table.control_count if refinement is None else refinement.shape[0]
-        self._refinement = None if refinement is None else SparseMatrix.shared(refinement, float_type)
-        controls, are_rounded = types.indices(table.controls), refinement is not None
-        self._parts = [_Part(types, part, controls, are_rounded) for part in table.polynomials]
+        controls, refinement = table.patches.control_rows()
+        self._refined_count = self.control_count if refinement is None else refinement.row_count
+        self._refinement = None if refinement is None else shared(SparseMatrix, refinement, float_type)
+        indices, are_rounded = types.indices(controls), refinement is not None
+        self._parts = [_Part(types, part, indices, are_rounded) for part in table.polynomials]
         self._weld_target = types.indices(table.weld_target) if table.copies.size else None
 
     def __call__(self, control_points: FloatBuffer) -> tuple[FloatBuffer, FloatBuffer]:

@@ -123,7 +123,7 @@ class SharpMesh:
             cut = CutMesh(t.with_rules(rules, None), np.arange(t.vertex_count))
         else:
             face_vertices, vertex = _split_vertices(self, is_border)
-            edge_names = np.where(is_cut, t.edge_count + np.arange(t.half_edge_count), t.edge)
+            edge_names = np.where(is_cut, t.edge_count + np.arange(t.half_edge_count, dtype=np.int32), t.edge)
             cut = CutMesh(Topology(len(vertex), t.face_sizes, face_vertices, edge_names, rules[vertex]), vertex)
         semi_sharpness = semi_sharpness_of_cut(self, cut)
         return CutMesh(cut.topology.with_rules(cut.topology.vertex_rules, semi_sharpness), cut.vertex)

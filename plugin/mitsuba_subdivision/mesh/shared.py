@@ -1,10 +1,11 @@
-"""Cache of shared values: shapes with the same topology share one set of tables."""
+"""Caches: shapes with the same topology share one set of tables, and drop what only their creation needs."""
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+from functools import cached_property
 from threading import Lock, RLock
 from typing import Any, TypeVar
 from weakref import WeakValueDictionary
@@ -50,6 +51,13 @@ class SharedArray:
     """An array as a shared value: on a device, or a NumPy array."""
 
     array: Any
+
+
+def forget(*values: Any) -> None:
+    """Drop cached properties of objects, which are computed again on demand."""
+    for value in values:
+        for name in [name for name, content in vars(type(value)).items() if isinstance(content, cached_property)]:
+            vars(value).pop(name, None)
 
 
 def shared(kind: Callable[..., Value], *arguments: Hashable) -> Value:

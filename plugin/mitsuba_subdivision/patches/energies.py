@@ -46,8 +46,8 @@ def energy_matrix(
     """Integrate an energy over a surface. Returns a symmetric (n, n) CSR array of float64."""
     from scipy import sparse
 
-    controls, refinement = patches.control_rows()
-    table = patches.evaluated
+    controls, stencils = patches.control_rows()
+    table, refinement = patches.evaluated, None if stencils is None else stencils.matrix
     points = control_points if refinement is None else refinement @ control_points
     total = sparse.csr_array((len(points), len(points)))
     for patch_class in counted(table.classes, "Energies of patch classes"):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +17,10 @@ from ..evaluation.patch_tree import PatchTree, patch_trees
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray, Topology
 from ..mesh.one_ring import RingTable, one_rings
-from ..mesh.shared import Content, shared_by_key
+from ..mesh.shared import Content, forget, shared_by_key
 from ..mesh.signature import Signature, fan_codes, row_codes, signatures_at
 from ..schemes.domain import FloatArray
-from ..schemes.scheme import Scheme
-
-if TYPE_CHECKING:
-    from scipy import sparse
+from ..schemes.scheme import Scheme, StencilTable
 
 # A cage with more than MANY_CLASSES classes, and on average fewer than FEW_PATCHES patches in each, is refined once if
 # that divides the number of classes by FEWER: a class costs milliseconds, refining a patch microseconds.
@@ -70,19 +66,23 @@ class PatchTable:
         # face of the dual begins at the lowest half-edge of its vertex. Holes and border vertices, which are no
         # elements, become faces without corners.
         self.elements = topology
-        # (n_h,) the half-edge of the mesh that corresponds to each half-edge of `elements`
-        self.half_edge_of_corner: IndexArray = np.arange(topology.half_edge_count, dtype=np.int32)
+        # Half-edges of the mesh that are half-edges of the elements
+        self._half_edges: IndexArray | slice = slice(None)
         t = topology
         if scheme.element == "vertex":
             offsets, half_edges = t.vertex_fans
             # A dual edge crosses the cage's edge that two successive faces about a vertex share.
             self.elements = Topology(t.face_count, np.diff(offsets), t.face[half_edges], t.edge[t.prev[half_edges]])
-            self.half_edge_of_corner = half_edges
+            self._half_edges = half_edges
         elif is_hole is not None and is_hole.any():
-            kept = t.half_edges_of(~is_hole).astype(np.int32)
+            self._half_edges = kept = t.half_edges_of(~is_hole).astype(np.int32)
             sizes = np.where(is_hole, 0, t.face_sizes)
             self.elements = Topology(t.vertex_count, sizes, t.face_vertices[kept], t.edge[kept])
-            self.half_edge_of_corner = kept
+
+    @cached_property
+    def half_edge_of_corner(self) -> IndexArray:
+        """``(n_h,)`` the half-edge of the mesh that corresponds to each half-edge of `elements`."""
+        return np.arange(self.topology.half_edge_count, dtype=np.int32)[self._half_edges]
 
     @cached_property
     def is_whole(self) -> NDArray[np.bool_]:
@@ -122,9 +122,7 @@ class PatchTable:
 
     def forget(self) -> None:
         """Drop data that are computed again on demand, for a mesh that only its kernels evaluate."""
-        for part in (self, self.topology, self.elements):
-            for name in [name for name, value in vars(type(part)).items() if isinstance(value, cached_property)]:
-                vars(part).pop(name, None)
+        forget(self, self.topology, self.elements)
 
     @property
     def patch_count(self) -> int:
@@ -155,8 +153,8 @@ class PatchTable:
         return order, np.flatnonzero(sorted_codes[1:] != sorted_codes[:-1]) + 1
 
     @cached_property
-    def refined(self) -> tuple[PatchTable, sparse.csr_array] | None:
-        """Patches of the cage refined once, and ``(n, n_v)`` weights of its vertices, if that leaves far fewer classes.
+    def refined(self) -> tuple[PatchTable, StencilTable] | None:
+        """Patches of the cage refined once, and the stencils of its vertices, if that leaves far fewer classes.
 
         As where polygons of many sizes meet vertices of many valences, and nearly every patch is a class: after a
         refinement, an old vertex has only new neighbours, which are of few kinds. All faces of the refined cage are
@@ -170,7 +168,7 @@ class PatchTable:
         table = PatchTable(refinement.topology, self.scheme, may_turn=False)
         if FEWER * table.class_count > self.class_count:
             return None
-        return table, refinement.stencils.matrix
+        return table, refinement.stencils
 
     @property
     def evaluated(self) -> PatchTable:
@@ -190,15 +188,15 @@ class PatchTable:
 
     def evaluated_points(self, points: FloatArray) -> FloatArray:
         """``(n, k)`` values at the vertices of the mesh of `evaluated`, from those at this table's mesh vertices."""
-        return points if self.refined is None else self.refined[1] @ points
+        return points if self.refined is None else self.refined[1].matrix @ points
 
     def control_rows(
         self,
         # By default those of the table
         control_of_vertex: IntArray | None = None,
         control_count: int = 0,
-    ) -> tuple[NDArray[np.uint32], sparse.csr_array | None]:
-        """`controls` as rows of control values; for refined patches, also the matrix that refines the cage's values."""
+    ) -> tuple[NDArray[np.uint32], StencilTable | None]:
+        """`controls` as rows of control values; for refined patches, also stencils that refine the cage's values."""
         if control_of_vertex is None:
             control_of_vertex, control_count = self.control_of_vertex, self.control_count
         if self.refined is not None:
@@ -275,13 +273,9 @@ class PatchTable:
         return corners + turns, least
 
 
-def _over_control_values(
-    weights: sparse.csr_array, control_of_vertex: IntArray, control_count: int
-) -> sparse.csr_array:
-    from scipy import sparse
-
-    # Mesh vertices with the same control value share a column, where their weights add up, in place.
-    columns, shape = control_of_vertex.astype(weights.indices.dtype)[weights.indices], (weights.shape[0], control_count)
-    matrix = sparse.csr_array((weights.data, columns, weights.indptr), shape=shape, copy=True)
-    matrix.sum_duplicates()
-    return matrix
+def _over_control_values(stencils: StencilTable, control_of_vertex: IntArray, control_count: int) -> StencilTable:
+    """Stencils over control values, sorted. Weights of vertices with the same value add up."""
+    columns = control_of_vertex.astype(np.int32)[stencils.columns]
+    order, begins = ragged.sorted_order(stencils.rows * np.int64(control_count) + columns)
+    first, weights = order[begins], np.add.reduceat(stencils.weights[order], np.flatnonzero(begins))
+    return StencilTable(stencils.row_count, control_count, stencils.rows[first], columns[first], weights)

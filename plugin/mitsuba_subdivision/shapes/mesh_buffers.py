@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 # Largest number of vertices of loaded control points that shapes of equal cages share, in object space: few take longer
 # to trace than to compute, and more take memory.
-MOST_SHARED = 1 << 14
+MOST_SHARED = 1 << 16
 
 
 class Triangles(NamedTuple):

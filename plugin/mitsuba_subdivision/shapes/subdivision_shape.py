@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..device_arrays import mapped
 from ..kernels.array_types import Float, FloatBuffer, Index, IndexBuffer, Mask, Matrix4, Vector2, Vector3
 from ..llvm import require_llvm
+from ..mesh.shared import forget
 from ..surface import TEXCOORDS
 from ..variants import Variant
 from .cage_attributes import PREFIX, WIDTHS, CageAttributes, mesh_attributes, mesh_name
@@ -84,13 +85,7 @@ def make_subdivision(
 
             recentres, placed = parameters.evaluator == "stabilized", (self.to_world, parameters.to_world)
             self._placement = Placement(surface.cage.positions, kind, *placed, recentres=recentres)
-            # The surface of hits and of displaced normals, and the attributes that are evaluated at hits
-            on_device: SurfaceKernel | None = None
-            if is_exact or (is_jit and parameters.displacement is not None):
-                from ..kernels.surface_kernel import SurfaceKernel
-
-                on_device = SurfaceKernel(surface.pieces(), variant.Float)
-                on_device.values.load(self._placement.positions)
+            # The attributes that are evaluated at hits, and the surface of hits and of displaced normals
             channels: dict[str, ChannelKernel] = {}
             if is_exact and surface.attribute_names:
                 from ..kernels.channel_kernel import ChannelKernel
@@ -99,6 +94,15 @@ def make_subdivision(
                     channel = surface.channel(name)
                     if name == TEXCOORDS or channel.values.shape[1] in WIDTHS:
                         channels[name] = ChannelKernel(channel, variant.Float)
+                        # Their tables take the most memory, and only attributes at vertices need them again.
+                        if not self._at_vertices and channel.layout.patches is not surface.patches:
+                            channel.layout.patches.forget()
+            on_device: SurfaceKernel | None = None
+            if is_exact or (is_jit and parameters.displacement is not None):
+                from ..kernels.surface_kernel import SurfaceKernel
+
+                on_device = SurfaceKernel(surface.pieces(), variant.Float)
+                on_device.values.load(self._placement.positions)
             self._displacement: ShapeDisplacement | None = None
             if parameters.displacement is not None:
                 from .displacement import ShapeDisplacement
@@ -140,6 +144,7 @@ def make_subdivision(
             # Kernels have their tables; updates compute the rest again.
             for patches in {surface.patches, *(surface.channel(name).layout.patches for name in channels)}:
                 patches.forget()
+            forget(surface.cage.topology, triangles.table, triangles.layout)
 
         def _triangles(self, control_points: NDArray[np.float64], to_world: NDArray[np.float64]) -> Triangles:
             parameters, surface = self._parameters, self._parameters.surface

@@ -73,9 +73,7 @@ def adaptive_table(
     if criterion.outline is None:
         _warn_of_coarse(patches, needed, tiles, max_rate, cage_name)
     grid = AdaptiveGrid.of(tiles, frames)
-    polynomials, (controls, refinement) = _polynomials(patches, grid), patches.control_rows()
-    counts = patches.control_count, patches.patch_count
-    return VertexTable(*counts, grid, polynomials, controls, grid.copies(), refinement)
+    return VertexTable(patches, patches.patch_count, grid, _polynomials(patches, grid), grid.copies())
 
 
 def _polynomials(patches: PatchTable, grid: AdaptiveGrid) -> tuple[VertexPolynomials, ...]:

@@ -72,7 +72,7 @@ class AttributeLayout:
 
 
 def _interpolated(table: VertexTable, channel: Channel) -> FloatArray:
-    control_values = np.zeros((table.control_count, channel.values.shape[1]))
+    control_values = np.zeros((table.patches.control_count, channel.values.shape[1]))
     control_values[channel.layout.patches.control_of_vertex] = channel.values[channel.layout.value_index]
     return table.interpolated(control_values)
 

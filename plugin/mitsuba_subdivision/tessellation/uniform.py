@@ -35,9 +35,7 @@ def _table(patches: PatchTable, rate: int) -> VertexTable:
         expected = f"at most {MOST_VERTICES}, whose triangles fit into a buffer"
         raise ValueError(f"tessellation rate {rate} makes {grid.vertex_count} vertices; expected {expected}")
     require_memory(patches, grid)
-    polynomials, (controls, refinement) = _polynomials(patches, grid), patches.control_rows()
-    counts = patches.control_count, patches.patch_count
-    return VertexTable(*counts, grid, polynomials, controls, _copies(patches, grid), refinement)
+    return VertexTable(patches, patches.patch_count, grid, _polynomials(patches, grid), _copies(patches, grid))
 
 
 def checked_rate(rate: int, name: str = "tessellation rate") -> int:

@@ -17,7 +17,7 @@ from ..evaluation.patch_tree import patch_tree
 from ..evaluation.polynomials import monomial_values, polynomial_basis
 from ..mesh import ragged
 from ..mesh.connectivity import IndexArray, IntArray
-from ..patches.patch_table import PatchClass
+from ..patches.patch_table import PatchClass, PatchTable
 from ..schemes import FloatArray, Scheme
 
 if TYPE_CHECKING:
@@ -37,17 +37,13 @@ PATCHES_TOGETHER = 1 << 7
 class VertexTable:
     """A tessellation: its triangles, and its vertices on polynomials, whose weights do not depend on positions."""
 
-    control_count: int
+    patches: PatchTable
     patch_count: int
     grid: UniformGrid | AdaptiveGrid  # Numbers and locates the vertices and triangles
     polynomials: tuple[VertexPolynomials, ...]  # Polynomials on which the vertices lie
-    # (n,) uint32: control points, or refined ones if there is a `refinement`, of the patches of all classes
-    controls: NDArray[np.uint32]
     # (2, n) int64: copies, and the vertices whose positions they take. Each side of a crease has its own vertices, with
     # different normals but bitwise equal positions.
     copies: IntArray
-    # (n, control_count) matrix from control points to refined ones, if patches are those of the cage refined once
-    refinement: sparse.csr_array | None = None
 
     @property
     def vertex_count(self) -> int:
@@ -92,11 +88,12 @@ class VertexTable:
     def _evaluated(
         self, control_points: FloatArray, *, with_normals: bool
     ) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+        controls, refinement = self.patches.control_rows()
         # Refined control points are rounded before another one is subtracted.
-        least_extent = 0.0 if self.refinement is None else LEAST_EXTENT[64]
-        points = control_points if self.refinement is None else self.refinement @ control_points
+        least_extent = 0.0 if refinement is None else LEAST_EXTENT[64]
+        points = control_points if refinement is None else refinement.matrix @ control_points
         for part in self.polynomials:
-            yield from part.evaluated(self.controls, points, least_extent, with_normals=with_normals)
+            yield from part.evaluated(controls, points, least_extent, with_normals=with_normals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +108,7 @@ class VertexPolynomials:
     powers: IntArray  # (m, 2) int64: exponents of the monomials in parameters from the middle of the domain
     # (b, m, K) float64 for each size K of one-rings in ascending order: blocks of the classes of that size
     weights: tuple[FloatArray, ...]
-    # (b, 3) int64, for each block: index of the class's first entry in `VertexTable.controls`, where controls are
+    # (b, 3) int64, for each block: index of the class's first entry in `PatchTable.controls`, where controls are
     # stored column by column; number of patches of the class; number of controls per patch
     blocks: IntArray
     # (b,) float64: upper bound of the sum of the absolute weights in either tangent of a vertex
@@ -127,7 +124,7 @@ class VertexPolynomials:
 
     def evaluated(
         self,
-        controls: NDArray[np.uint32],  # `VertexTable.controls`
+        controls: NDArray[np.uint32],  # Of the patches of all classes
         points: FloatArray,  # (n, k) float64: points that these refer to
         least_extent: float,  # Of patches, for `unit_normals`, relative to a control point
         *,
