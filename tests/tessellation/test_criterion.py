@@ -78,7 +78,8 @@ def test_a_warning_names_the_highest_rate_that_the_limit_needs(name, measure):
     surface, rates = surface_named(name), [2]
     criterion = Criterion(measure, {"chord": 1e-3, "edge": 0.05}[measure] * size_of(surface))
     while True:
-        with warnings.catch_warnings(record=True, action="always") as caught:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
             table = surface.adaptive_sampling(criterion, rates[-1])
         if not caught:
             break
