@@ -138,16 +138,14 @@ class ExactShading:
         # Negative where the ray hits the triangle from outside
         side = dot(vector3(dr.detach(si.n)), dr.detach(ray_d))
         limits = {"max_distance": farthest, "wanted_sign": side * self._sign}
-        # Equal operations are few, and searching for them takes a twentieth of the time of tracing.
-        with dr.scoped_set_flag(dr.JitFlag.ValueNumbering, False):
-            location, kind, known = kernel.line_hits(hit, d, location, active, **limits)
-            self._count(kind, active)
-            to_world = AffineMap.of(self.to_world) if moves and dr.grad_enabled(self.to_world) else self._map
-            lines = None
-            if not flags & _FOLLOWS and (moves or dr.grad_enabled(ray.o, ray.d)):
-                lines = Lines(to_world.inverse_point(ray_o), to_world.inverse_direction(ray_d), kind == ON_LINE)
-            order = 2 if flags & _NORMAL_DERIVATIVES else 1
-            points = kernel.at(location, active, order, constraint=lines, moves=moves, known=known)
+        location, kind, known = kernel.line_hits(hit, d, location, active, **limits)
+        self._count(kind, active)
+        to_world = AffineMap.of(self.to_world) if moves and dr.grad_enabled(self.to_world) else self._map
+        lines = None
+        if not flags & _FOLLOWS and (moves or dr.grad_enabled(ray.o, ray.d)):
+            lines = Lines(to_world.inverse_point(ray_o), to_world.inverse_direction(ray_d), kind == ON_LINE)
+        order = 2 if flags & _NORMAL_DERIVATIVES else 1
+        points = kernel.at(location, active, order, constraint=lines, moves=moves, known=known)
         is_before = active & (dot(dr.detach(points.p) - hit, d) < 0)
         points = points.placed(to_world)
         if flags & _PARAMETERS:
