@@ -55,7 +55,7 @@ def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkey
     expected = stencils.matrix @ positions[surface.cage.cut_mesh.vertex]
     np.testing.assert_allclose(refinement.matrix @ positions, expected, rtol=0, atol=ROUNDING)
     np.testing.assert_array_equal(controls, refined.controls)
-    assert surface.patches.control_rows()[1] is refinement
+    assert surface.patches.control_rows(table.control_of_vertex, table.control_count)[1] is refinement
     # The patch at a half-edge is the refined face there.
     corners = np.concatenate([group.corners for group in refined.classes])
     for half_edge, code in enumerate(table.half_edges[:, layout.CODE]):

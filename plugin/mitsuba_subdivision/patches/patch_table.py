@@ -66,8 +66,8 @@ class PatchTable:
         # face of the dual begins at the lowest half-edge of its vertex. Holes and border vertices, which are no
         # elements, become faces without corners.
         self.elements = topology
-        # Half-edges of the mesh that are half-edges of the elements
-        self._half_edges: IndexArray | slice = slice(None)
+        # `half_edge_of_corner`; None if it is the identity, as for most cages
+        self._half_edges: IndexArray | None = None
         t = topology
         if scheme.element == "vertex":
             offsets, half_edges = t.vertex_fans
@@ -82,7 +82,9 @@ class PatchTable:
     @cached_property
     def half_edge_of_corner(self) -> IndexArray:
         """``(n_h,)`` the half-edge of the mesh that corresponds to each half-edge of `elements`."""
-        return np.arange(self.topology.half_edge_count, dtype=np.int32)[self._half_edges]
+        if self._half_edges is not None:
+            return self._half_edges
+        return np.arange(self.topology.half_edge_count, dtype=np.int32)
 
     @cached_property
     def is_whole(self) -> NDArray[np.bool_]:

@@ -112,7 +112,7 @@ def _short(value: float) -> str:
 
 
 class _SceneParts:
-    """Files beside a scene's XML file: data of the entry NAME become `SCENE_NAME` with a suffix. None is an input."""
+    """Files beside a scene's XML file, other than inputs: data of the entry NAME become `SCENE_NAME` with a suffix."""
 
     def __init__(self, path: Path, inputs: Iterable[Path]) -> None:
         self._path, self._inputs = path, list(inputs)

@@ -38,7 +38,7 @@ class VertexTable:
     """A tessellation: its triangles, and its vertices on polynomials, whose weights do not depend on positions."""
 
     patches: PatchTable
-    patch_count: int
+    patch_count: int  # Kept, as the patches may forget what they count
     grid: UniformGrid | AdaptiveGrid  # Numbers and locates the vertices and triangles
     polynomials: tuple[VertexPolynomials, ...]  # Polynomials on which the vertices lie
     # (2, n) int64: copies, and the vertices whose positions they take. Each side of a crease has its own vertices, with
