@@ -60,7 +60,8 @@ def coarse(monkeypatch):
     constants = {
         "cages": {"CREASE_RATE": 3},
         "normal_error": {"VALENCES": (3,), "OFFSETS": (0,), "LEVELS": np.arange(3), "TURNS": normal_error.TURNS[:2]},
-        "scenes": {"COLUMNS": 96, "ROWS": 96, "FINE_LEVEL": 3, "OWN_LEVEL": 3, "STRIPE_PIXELS": 256},
+        "scenes": {"COLUMNS": 96, "ROWS": 96},
+        "zebra": {"FINE_LEVEL": 3, "OWN_LEVEL": 3, "STRIPE_PIXELS": 256},
         "fit": {"STEPS": 2, "CREASE_STEPS": 1, "RATE": 4, "PIXELS": 12, "BOX_PIXELS": 12, "VIEWS": 2, "SPP": 1}
         | {"TARGET_SPP": 1, "SAMPLES": 500, "FINE": 3, "DENSE": 3},
     }

@@ -9,7 +9,7 @@ import pytest
 from mitsuba_subdivision import variants
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.commands import pictures
-from mitsuba_subdivision.commands.pictures import render_on_cluster
+from mitsuba_subdivision.commands.cluster import render_on_cluster
 from mitsuba_subdivision.regression import RegressionError, renders
 from mitsuba_subdivision.regression import scene as scenes
 from mitsuba_subdivision.regression.compare import Comparison

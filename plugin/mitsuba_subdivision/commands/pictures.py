@@ -1,19 +1,17 @@
-"""Pictures, frames, videos and passes of scenes and models for the command ``render``, here or on a Dask cluster."""
+"""Pictures, frames, videos and passes of scenes and models, for the command ``render``."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import pickle
-import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 from uuid import uuid4
 
 import mitsuba as mi
@@ -22,9 +20,9 @@ from numpy.typing import NDArray
 
 from ..cage.errors import CageWarning, warn
 from ..files.formats import is_usd
-from ..messages import counted, print_remark, print_result, timed
-from ..regression import RegressionError, renders
-from ..regression.image import METADATA_ATTRIBUTE, Image, save_image
+from ..messages import counted, print_remark, print_result
+from ..regression import renders
+from ..regression.image import METADATA_ATTRIBUTE, save_image
 from ..regression.scene import BOX, LoadedScene, load_scene, render_image
 from ..regression.tiers import Tolerances
 from ..studio import DEFAULT_VIEW, Look, sampler
@@ -33,13 +31,10 @@ from ..studio.cage_scenes import CageScenes
 from ..studio.picture import denoised, shading_for, weigh_lights
 from ..studio.saving import save_scene
 from ..studio.studio_entries import LENGTHS, VIEWS
-from ..variants import set_variant, threads_set
+from ..variants import threads_set
 from ..whole_file import require_writable, whole_file
+from .cluster import cluster, render_on_cluster, results
 
-if TYPE_CHECKING:
-    from distributed import Client
-
-T = TypeVar("T")
 VIDEO_SUFFIXES = (".gif", ".mp4")
 DEFAULT_FPS = 24
 # Options for one mesh of a USD file, and for whole USD files.
@@ -49,8 +44,6 @@ _OF_STAGES = ("shutter", "texture_size", "camera", "over")
 _OF_LOOK = ("up", "size", "spp", "rate", "checker", "cage", "texture_size", "transparent", "aovs")
 EVEN = 2  # Sides of pictures in MP4 files are multiples of this; others lose a row or a column
 _Shown = tuple[StillPicture, SceneSource[Any]]
-# One render at a time in a worker: Mitsuba has one variant at a time, and an LLVM variant uses all cores.
-_lock = threading.Lock()
 
 
 class Picture(NamedTuple):
@@ -195,60 +188,6 @@ def render_by_passes(options: argparse.Namespace, is_model: bool) -> None:
         image = renders.as_reference(image, options.scene, options.output, tolerances)
     save_image(options.output, image)
     print_result(options.output)
-
-
-@contextmanager
-def cluster(address: str) -> Iterator[Client]:
-    """The cluster of a scheduler, at an address such as "tcp://farm:8786"."""
-    try:
-        from distributed import Client
-    except ImportError:
-        raise RegressionError("Dask is not installed: pip install 'mitsuba-subdivision[dask]'") from None
-    try:
-        client = Client(address, timeout=10)
-    except (OSError, ValueError) as error:
-        raise RegressionError(f'no Dask scheduler at "{address}": {error}') from None
-    with client:
-        if not client.nthreads():
-            raise RegressionError(f'the Dask scheduler at "{address}" has no workers')
-        yield client
-
-
-def results(client: Client, work: Callable[[int], T], numbers: Sequence[int]) -> Iterator[tuple[int, T]]:
-    """Numbers and results of picklable work, in the order of completion; work of lost workers is repeated."""
-    from distributed import as_completed
-
-    # Not pure in Dask's sense: a repeated request renders again.
-    futures = as_completed(client.map(partial(_work, work, str(mi.variant())), numbers, pure=False), with_results=True)
-    return (result for _, result in futures)
-
-
-def _work(work: Callable[[int], T], variant: str, number: int) -> tuple[int, T]:
-    with _lock:
-        set_variant(variant)
-        return number, work(number)
-
-
-def render_on_cluster(
-    address: str,
-    load: Callable[[], LoadedScene],  # Picklable
-    sampling: renders.Sampling,
-    count: int,  # 0 for the number of threads
-    *,
-    with_probe: bool = False,
-) -> Image:
-    """Render passes of an image on the workers of a cluster, by default one for each of their threads, and merge them.
-
-    With the box filter and an LLVM variant, the image has the same bits as the same passes on one machine with the
-    workers' versions and processor.
-    """
-    with cluster(address) as client, timed("Rendering on the cluster"):
-        count = count or min(sum(client.nthreads().values()), sampling.batches)
-
-        def work(number: int) -> Image:
-            return renders.render_pass(load(), sampling, number, count, with_probe=with_probe)
-
-        return renders.merge_passes([image for _, image in results(client, work, range(1, count + 1))])
 
 
 def _as_data(options: argparse.Namespace) -> dict[str, Any]:

@@ -61,7 +61,7 @@ _FIGURES = (
     Figure("shading", "scenes", "brushed metal, shaded by vertices and exactly at every hit", ("spp",)),
     Figure("displacement", "scenes", "a jar before and after it is displaced, and its triangles", ("spp",)),
     Figure("zoom", "normal_error", "an extraordinary vertex, magnified up to a million times", ("spp",)),
-    Figure("zebra", "scenes", "reflection lines with exact normals, and by usual methods", ("spp", "cage")),
+    Figure("zebra", "zebra", "reflection lines with exact normals, and by usual methods", ("spp", "cage")),
     Figure("curvature", "characteristic", "curvature around extraordinary vertices", ("cage",), has_numbers=True),
     Figure("fit", "fit", "cages fitted to pictures, and their distance from the target", ("spp",)),
     Figure("hero", "scenes", "a human figure and its control cage", ("spp",)),
