@@ -49,7 +49,7 @@ def frame_table(surface: LimitSurface) -> VertexTable:
 
 
 class Model:
-    """A cage in memory or of a file (`prim`, `time`, `scheme`), its limit surface, rods and balls that show the cage."""
+    """A cage in memory or of a file (`prim`, `time`, `scheme`), its limit surface, and rods and balls that show it."""
 
     def __init__(self, cage: ControlCage, path: Path | None = None, **chosen: Any) -> None:
         self.path, self.chosen = path, {name: value for name, value in chosen.items() if value is not None}
