@@ -32,7 +32,7 @@ IN_ONE_THREAD = {
 }
 
 
-# Of each core law, so that `-m core` takes half a minute: spread evenly over all of them.
+# Cases of each core law, so that `-m core` takes half a minute: spread evenly over all of them.
 CORE_CASES = 4
 
 

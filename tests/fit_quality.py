@@ -138,7 +138,7 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30)
 
 
-# Of a fit: unknowns, distance, angle of normals, part of triangles that are folded over, seconds of a step.
+# Measures of a fit: unknowns, distance, angle of normals, part of triangles that are folded over, seconds of a step.
 Result = tuple[int, float, float, float, float]
 
 

@@ -25,7 +25,7 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 BITMAP = re.compile(r'<img src="data:(image/\w+);base64,\s*([^"]+)"')
 PICTURES = ("image/png", "image/jpeg")
 JPEG_QUALITY = 90
-# Of a cell, in seconds.
+# Seconds for a cell.
 TIMEOUT = 300
 
 

@@ -67,7 +67,7 @@ def test_seams_and_pieces_are_counted():
     assert inspected["attributes"] == {"texcoords": texcoords, "age": "vertex"}
 
 
-# Of another sharpness each, so that all patches differ, and refinement has to follow them far down.
+# Creases of another sharpness each, so that all patches differ, and refinement has to follow them far down.
 STARTS = [14 * j + i for j in range(1, 13) for i in range(13)]
 MANY = [(start, start + 1, 9.5 - 0.001 * number) for number, start in enumerate(STARTS)]
 TAKES_LONG = "classes of patches, semi-sharp up to 9.5: preparing them takes longer"

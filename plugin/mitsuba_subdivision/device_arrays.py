@@ -5,7 +5,8 @@ load whole packets, the last of which may reach beyond the array to an unmapped 
 such an array while it is recorded.
 
 - `mapped` maps a copy in NumPy's memory that reaches two packets beyond its values. All threads may read it, so that
-shapes share such tables. - `upload` copies into Dr.Jit's own memory, and waits for the copy: for arrays of users.
+  shapes share such tables.
+- `upload` copies into Dr.Jit's own memory, and waits for the copy: for arrays of users.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""Copies in place of many instances, whose code takes JIT variants a time that is quadratic in their number."""
+"""Copies in place of many instances, which take JIT variants a time quadratic in their number."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -12,6 +11,7 @@ from mitsuba_subdivision.cage import Attribute, CageContents, CageSource
 from mitsuba_subdivision.files import reversed_order
 from mitsuba_subdivision.mesh import IntArray
 from mitsuba_subdivision.mitsuba_mesh import points_at
+from mitsuba_subdivision.studio import available_memory
 from numpy.typing import NDArray
 
 from .contents import SceneContents, ShapeContents
@@ -20,7 +20,7 @@ from .stage_warnings import StageWarnings
 LEAST_INSTANCES = 64  # Fewer instances cost less than a second in each picture
 # Faces of meshes whose copies load sooner as separate shapes than as one mesh, in a third of the memory.
 LARGE = 10_000
-# Measured memory of copies as one mesh; and its largest part of the machine's memory, and largest size.
+# Measured memory of copies as one mesh; and its largest part of the available memory, and largest size.
 FACE_BYTES, TRIANGLE_BYTES, POINT_BYTES = {"exact": 600, "vertex": 300}, 170, 400
 MOST_PART, MOST_BYTES = 0.75, 6e9
 # Time of a picture of instances, which grows with the square of their number.
@@ -105,7 +105,8 @@ def with_copies(
 
 
 def _allowed_bytes() -> float:
-    return min(MOST_BYTES, MOST_PART * os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    available = available_memory()
+    return MOST_BYTES if available is None else min(MOST_BYTES, MOST_PART * available)
 
 
 def _bytes(rates: Rates, most: int, shading: str) -> float:

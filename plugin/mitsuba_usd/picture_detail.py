@@ -24,7 +24,7 @@ from .textures import Textures, samples_elsewhere
 
 TEXELS_PER_PIXEL = 2.0  # Texels for each pixel: filters see details of half a pixel, and glass magnifies
 # Quantile of edges, as a few may have collapsed in the texture; quantile of texels; most edges that are measured.
-_MOST_EDGES, _MOST_TEXELS, _MOST_SAMPLES = 0.95, 0.99, 20_000
+_EDGE_QUANTILE, _TEXEL_QUANTILE, _MOST_SAMPLES = 0.95, 0.99, 20_000
 # Outlines of sensors and the distances of their near planes; see `outline_for`.
 Views = Sequence[tuple[SceneNode, float]]
 _CONSTANT = "vertex_constant_displacement"  # Attribute of shapes whose displacement is constant
@@ -102,7 +102,7 @@ def texels_for_pictures(contents: SceneContents, sensors: Sequence[SceneNode]) -
         lengths, in_texture = (np.linalg.norm(vectors, axis=1) for vectors in _edges(shape.cage))
         there, texels = in_texture > 0, np.inf
         if there.any():
-            scale = float(np.quantile(lengths[there] / in_texture[there], _MOST_EDGES))
+            scale = float(np.quantile(lengths[there] / in_texture[there], _EDGE_QUANTILE))
             texels = TEXELS_PER_PIXEL * scale * pixels_of(shape.cage, copies, seen)
         inputs = shape.material.inputs.values()
         # Images at computed texture coordinates have an unknown detail.
@@ -155,12 +155,12 @@ def rate_of_heights(cage: CageContents, texture: SceneNode, error: float) -> int
     length = 1  # In texels, powers of two
     while 4 * length <= min(heights.shape):
         away = [np.abs(h[2 * length :] + h[: -2 * length] - 2 * h[length:-length]) / 2 for h in (heights, heights.T)]
-        if max(np.quantile(part, _MOST_TEXELS) for part in away) > error:
+        if max(np.quantile(part, _TEXEL_QUANTILE) for part in away) > error:
             break
         length *= 2
     to_texels = np.array(texture["to_uv"].matrix)[:2, :2] * np.array(heights.shape[::-1])[:, None]
     texels = np.abs(_edges(cage)[1] @ to_texels.T).max(axis=1)
-    return max(1, math.ceil(float(np.quantile(texels, _MOST_EDGES)) / length))
+    return max(1, math.ceil(float(np.quantile(texels, _EDGE_QUANTILE)) / length))
 
 
 def with_own_parameters(

@@ -142,7 +142,7 @@ def size_of(contents: SceneContents) -> float:
 
 
 class Surfaces:
-    """Cache of limit surfaces: all four bishops share one."""
+    """Cache of limit surfaces, which equal cages share."""
 
     def __init__(self) -> None:
         self._known: dict[tuple[int, ...], list[tuple[CageContents, LimitSurface]]] = {}
@@ -217,8 +217,8 @@ def _sampling(surface: LimitSurface) -> Callable[[NDArray[np.float64]], NDArray[
 def subdivision(
     shape: ShapeContents,
     surfaces: Surfaces,
-    bsdf: SceneNode,
-    emitter: SceneNode | None,
+    material: SceneNode,
+    light: SceneNode | None,
     parameters: dict[str, Any],  # Of the shape `subdivision`
     notes: StageWarnings,
 ) -> SceneNode:
@@ -235,8 +235,8 @@ def subdivision(
         **({} if shown is None else {"shown_faces": tensor(shown.astype(np.uint32))}),
         **parameters,
         "to_world": mi.ScalarTransform4f(shape.to_world.tolist()),
-        "bsdf": bsdf,
-        **({} if emitter is None else {"emitter": emitter}),
+        "bsdf": material,
+        **({} if light is None else {"emitter": light}),
     }
 
 

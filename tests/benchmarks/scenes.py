@@ -32,7 +32,7 @@ SHADINGS = ("vertex", "exact")
 # Segments on each edge with which the surface looks alike.
 RATES = {"vertex": 8, "exact": 2}
 SIX_CAGES = ("rook", "human", "star", "jar", "barrel", "propeller")
-# Of shapes outside groups, instances, and groups of one shape.
+# Numbers of shapes outside groups, of instances, and of groups of one shape.
 GROWTH = ((50, 50, 1), (100, 100, 1), (200, 200, 1), (100, 100, 10), (100, 200, 10), (100, 200, 20), (200, 400, 20))
 COPIES = (400, 1_000, 5_000, 20_000)
 FEW, MANY = 6, 42

@@ -20,7 +20,7 @@ POINTS = [(x, y, z) for y in (-1.0, 1.2) for x, z in PENTAGON]
 POINTS += [(-1.2, 2.4, -0.3), (0.9, 2.2, 0.2), (0.9, 2.0, 2.6), (0.0, 2.9, 0.0), (0.1, -1.5, 0.9)]
 SIDES = [(i, i + 5, (i + 1) % 5 + 5, (i + 1) % 5) for i in range(5)]
 FACES = [*SIDES, *((i, (i + 1) % 5, 14) for i in range(5)), (6, 5, 10, 13, 11), (8, 7, 12)]
-# Of edges, by their vertices, and of vertices.
+# Creases of edges, by their vertices, and of vertices.
 EDGE_CREASES = {(0, 1): 1.0, (1, 2): 0.5, (2, 7): 0.3, (5, 10): 0.6, (10, 13): 0.4, (0, 5): 0.2, (8, 9): 0.7}
 VERTEX_CREASES = {4: 0.55, 9: 1.0, 13: 0.3}
 CORNERS = list(itertools.product((-1.0, 1.0), repeat=3))

@@ -153,7 +153,7 @@ def bound_color(prim):
     return tuple(material.ComputeSurfaceSource("mtlx")[0].GetInput("base_color").Get())
 
 
-# Of points up to thirty units away, in single precision.
+# Largest distance of points up to thirty units away, in single precision.
 POINT_TOLERANCE = 3e-5
 
 

@@ -11,7 +11,7 @@ from notebooks import FOLDER, NOTEBOOKS, executed, has_picture, picture
 from PIL import Image
 
 EVERY_NOTEBOOK = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-# Of a file, in bytes: pages of a repository, not an archive of pictures.
+# Largest size of a file in bytes: pages of a repository, not an archive of pictures.
 LARGEST = 250_000
 # Pictures are compared by the mean colours, from 0 to 1, of blocks of so many pixels along each side: few samples per
 # pixel make noise. The dark spot is 0.1 and more.

@@ -7,7 +7,7 @@ from reference.bars import CURVATURE_LEVELS
 from reference.exact_samples import SCHEMES, angle, curvature_error
 from scipy.sparse import csr_array
 
-# Of the errors of samples, by the column of `accuracy.py`.
+# Bounds of the errors of samples, by the column of `accuracy.py`.
 BARS = {
     "point": bars.POINT,
     "d/du, d/dv": bars.DERIVATIVE,

@@ -10,7 +10,7 @@ from reference.refined_cages import channel_of, half_disc, tagged
 from reference.refinement import refined
 
 INFINITE = 10.0
-# Of values of size one, in float64.
+# Rounding of values of size one, in float64.
 ROUNDING = 2e-14
 
 

@@ -16,7 +16,7 @@ from reference.refined_cages import sheet, spokes, tagged
 pytestmark = pytest.mark.core
 
 INFINITE = 10.0
-# Of cages of size about 2, in float64.
+# Rounding of points and normals of cages of size about 2, in float64.
 POSITION = 1e-14
 NORMAL = 1e-9
 # Sums of products of some fifty weights.

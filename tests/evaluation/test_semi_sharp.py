@@ -10,7 +10,7 @@ from mitsuba_subdivision.schemes import CatmullClark
 from patches.closed_cages import bumpy
 from reference.refined_cages import sheet, tagged
 
-# Of cages of size about 2, in float64.
+# Rounding of points of cages of size about 2, in float64.
 POSITION = 1e-14
 
 

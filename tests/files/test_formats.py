@@ -245,7 +245,7 @@ def save(path, triangles, *data):
     write_triangles(path, Triangles(triangles.positions, triangles.normals, triangles.triangles, *data))
 
 
-# Of OBJ files, Mitsuba numbers vertices anew, and its parser of numbers is right to a few units in the last place.
+# Mitsuba numbers vertices of OBJ files anew, and its parser of numbers is right to a few units in the last place.
 @pytest.mark.parametrize(
     ("kind", "options", "rtol", "atol"), [("ply", {}, 1e-7, 1e-6), ("obj", {"flip_tex_coords": False}, 1e-6, 1e-7)]
 )

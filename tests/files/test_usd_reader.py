@@ -427,7 +427,7 @@ HOUSE = """def Mesh "house" {
 }
 """
 
-# Of sums of some numbers of order one.
+# Rounding of sums of some numbers of order one.
 ROUNDING = 1e-15
 
 

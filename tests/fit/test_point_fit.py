@@ -6,7 +6,7 @@ from mitsuba_subdivision.fit import PointFit, Schedule, to_mesh
 from patches.closed_cages import torus
 from reference.refined_cages import tagged
 
-# Of the size of the box around the points. With no noise, only the regularizer is in the way.
+# Distance relative to the size of the box around the points. With no noise, only the regularizer is in the way.
 FOUND = 1e-4
 # Control points move this much, so that the surface is clearly another one.
 MOVED = 0.1

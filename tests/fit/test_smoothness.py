@@ -11,7 +11,7 @@ from mitsuba_subdivision.fit import LargeSteps, regularizer
 from mitsuba_subdivision.fit.smoothness import LEAST_COSINE, folds, quadratic_form
 from patches.closed_cages import torus
 
-# Of sums of float32 numbers.
+# Rounding of sums of float32 numbers.
 ROUNDING = 1e-6
 # Central differences of values near one, in float32.
 STEP, DIFFERENCE = 1e-3, 2e-3

@@ -7,9 +7,9 @@ from patches.closed_cages import bumpy, mixed_torus, triangulated
 from reference.refined_cages import tagged
 
 HIGHEST = 3
-# Of points of the size of one.
+# Rounding of points of size one.
 ROUNDING = 1e-12
-# Of central differences; the derivatives are one-sided differences of 1e-6, and Chaikin's polynomials are curved.
+# Central differences: step and error. Derivatives are one-sided differences of 1e-6; Chaikin's polynomials are curved.
 STEP, DIFFERENCE = 1e-4, 1e-6
 
 CAGES = {

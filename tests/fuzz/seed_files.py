@@ -25,7 +25,7 @@ WORDS = {
 }  # fmt: skip
 
 
-# Of USD files, texts only: the library trusts the sizes that its binary files announce.
+# Of USD files only texts: the library trusts the sizes that its binary files announce.
 _SEEDS = Path(__file__).with_name("seeds")
 # Ends of lines that files of a kind have.
 _ENDS = {"obj": (b"\n", b"\r\n"), "ply": (b"\n", b"\r\n", b"\r"), "usd": (b"\n",)}

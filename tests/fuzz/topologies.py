@@ -25,7 +25,7 @@ from reference.refined_cages import refined
 # Points and unit normals, of cages of a size of some units.
 POINT = 1e-11
 LENGTH, SINGLE_LENGTH = 1e-12, 1e-6
-# Of normals where tangents are at right angles and equally long; in radians.
+# Error of normals where tangents are at right angles and equally long; in radians.
 NORMAL = 1e-9
 # Tangents are known to so much of the cage's size, which matters where they are almost parallel or one is short.
 TANGENT = 1e-12

@@ -13,7 +13,7 @@ from mitsuba_subdivision.patches.polynomial_pieces import SurfacePieces
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (2, 0))
 # Exact for products of five polynomials of degree 3 in each parameter, two of them derivatives, or of degree 4.
 ORDER = 10
-# Of `LimitSurface.stiffness`, which gives the derivatives of areas.
+# Quadrature order of `LimitSurface.stiffness`, which gives the derivatives of areas.
 STIFFNESS_ORDER = 8
 # Levels around extraordinary points are summed until one is smaller than this part of the sum.
 LEFT_OUT, MOST_LEVELS = 1e-16, 200

@@ -7,11 +7,11 @@ from gradients.surfaces import CLOSED, motions
 from mitsuba_subdivision.kernels.array_types import ArrayTypes
 from mitsuba_subdivision.llvm import llvm_problem
 
-# Of sums over a surface, beside its largest integral or derivative.
+# Rounding of sums over a surface, relative to its largest integral or derivative.
 ROUNDING = 1e-12
 # Errors of triangles go with the square of their size: by doubling a rate, a quarter is left.
 RATES, QUARTER = (6, 12, 24), (0.2, 0.3)
-# Of the finest ones.
+# Largest relative error at the finest rate.
 FINEST = 5e-3
 TURN = np.array([0.3, -0.5, 0.7])
 AFFINE = {

@@ -17,8 +17,8 @@ pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 SAMPLES = 16
 # Differences of areas are of second order in the step, and scan lines have some distance.
 LINES = 1e-3
-# Of pictures of lit surfaces: a change in size, of which the error of differences is of second order; what derivatives
-# may be off beside random errors, and how large these may be.
+# Pictures of lit surfaces: samples per pixel; change in size, in which differences have an error of second order; error
+# of derivatives beside random errors, and bound of these.
 LIT_SAMPLES, GROWTH, BESIDE, NOISE = 64, 0.02, 3e-3, 4e-3
 # Corners of triangles of size one.
 SINGLE = 1e-6

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.skipif(llvm_problem() is not None, reason="no usable LL
 STEP, DIFFERENCES = 2e-4, 1e-9
 # Sums of products in another order, beside the sum of their absolute values.
 ROUNDING = 1e-13
-# Of adaptive tessellations, in sizes of the surface: rates differ from tile to tile.
+# Chord error of adaptive tessellations, in sizes of the surface: rates differ from tile to tile.
 CHORD = 0.01
 MATRIX = np.array([[1.1, 0.2, -0.3, 4], [0.1, 0.9, 0.25, -5], [-0.2, 0.3, 1.2, 6], [0, 0, 0, 1]])
 

@@ -15,7 +15,7 @@ from reference.refined_cages import sheet, spokes, tagged
 pytestmark = pytest.mark.usefixtures("llvm")
 
 DOUBLE, SINGLE = "llvm_ad_rgb_double", "llvm_ad_rgb"
-# Of values below one: some tens of products. Single precision has 2^29 times the rounding.
+# Rounding of values below one: some tens of products. Single precision has 2^29 times the rounding.
 ROUNDING = {DOUBLE: 2e-14, SINGLE: 2e-6}
 # Central differences of a step of 1e-6.
 STEP, DIFFERENCES = 1e-6, 1e-7

@@ -11,7 +11,7 @@ from patches.closed_cages import bumpy, extraordinary_triangles
 pytestmark = pytest.mark.usefixtures("llvm")
 
 DOUBLE, SINGLE = "llvm_ad_rgb_double", "llvm_ad_rgb"
-# Of points of a surface of a size of about 3, see test_surface_kernel.
+# Errors of points of a surface of a size of about 3, see test_surface_kernel.
 POINT = {DOUBLE: 1e-13, SINGLE: 1e-6}
 HIT = ["mixed torus", "sheet", "corner", "chaikin", "loop corner", "doo_sabin mixed torus"]
 # How far a hit is from its ray: the last of Newton's steps is below 3e-4 in parameters of a piece, and what is left is

@@ -9,7 +9,7 @@ pytestmark = [pytest.mark.core, pytest.mark.usefixtures("llvm")]
 SURFACES = ["hexagon", "valence 2", "crease", "holes", "non-manifold", "loop corner", "doo_sabin mixed torus"]
 TRIANGULATED = ["torus", "hexagon", "valence 2", "mixed torus", "half disc of 6", "boundary none", "holes", *HOLES]
 TRIANGULATED += ["loop corner", "loop mixed torus", "doo_sabin mixed torus", "doo_sabin sheet"]
-# Of parameters, after some sums and products.
+# Rounding of parameters after some sums and products.
 ROUNDING = 1e-14
 # How far beyond an edge parameters are. Of points of a surface of a size of about 3 there; where parameters are
 # rounded, points move along by some units of that.

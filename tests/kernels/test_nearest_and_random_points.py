@@ -10,7 +10,7 @@ pytestmark = pytest.mark.usefixtures("llvm")
 
 DOUBLE, SINGLE = "llvm_ad_rgb_double", "llvm_ad_rgb"
 
-# Of distances, in sizes of the surface. Measured: 2e-15 and 2e-7.
+# Errors of distances, in sizes of the surface. Measured: 2e-15 and 2e-7.
 BARS = {DOUBLE: 2e-14, SINGLE: 2e-6}
 # From a place that is some percent off, nearly all ways down lead to the same minimum.
 SAME = 0.95

@@ -34,8 +34,8 @@ from reference.refined_cages import half_disc, refine_first
 pytestmark = pytest.mark.usefixtures("llvm")
 
 DOUBLE, SINGLE = "llvm_ad_rgb_double", "llvm_ad_rgb"
-# Of cages of a size of about 3. Points are sums of some tens of products; normals and derivatives relative to their
-# length lose what the eigenbasis is ill-conditioned by, at valence 50 some hundred roundings.
+# Errors on cages of a size of about 3. Points are sums of some tens of products; normals, and derivatives relative to
+# their length, lose what the eigenbasis is ill-conditioned by, at valence 50 some hundred roundings.
 BARS = {
     DOUBLE: {"point": 1e-13, "normal": 1e-11, "derivative": 1e-11},
     # The same in single precision. Measured: 4e-7, 6e-6 and 7e-6, each at valence or face size 50; rounded up.
@@ -43,14 +43,14 @@ BARS = {
 }
 # Some tens of roundings in single precision.
 BORDER_NORMAL = 2e-6
-# Of the cage's size: what single precision cannot tell apart in coordinates of this size.
+# Relative to the cage's size: what single precision cannot tell apart in coordinates of this size.
 ONE_POINT = 2.0**-24
 # Central differences in double precision: truncation of about the step squared, rounding over the step.
 STEP = 1e-6
 DIFFERENCES, HIT_DIFFERENCES = 1e-7, 1e-6
 # Near extraordinary points, curvature grows beyond bounds, and so do derivatives and what differences leave out.
 STEEP = 1e-4
-# Of the largest: third derivatives are differences over 2^-10 of a piece, of polynomials of some curvature.
+# Relative to the largest: third derivatives are differences over 2^-10 of a piece, of polynomials of some curvature.
 THIRD = 1e-5
 
 
@@ -179,7 +179,7 @@ def test_a_scheme_of_a_user_is_evaluated(np_rng):
     assert_same(samples, known.evaluate(*locations), BARS[DOUBLE])
 
 
-# Of few control points each, as the kernels for derivatives by these take long to compile.
+# Cages of few control points, as the kernels for derivatives by these take long to compile.
 SMALL = {
     "control points of its own": ("catmull_clark", torus(3, 3)),
     "polygons": ("catmull_clark", tetrahedron()),

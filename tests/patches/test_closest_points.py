@@ -17,11 +17,11 @@ from scipy.spatial import cKDTree
 
 # Points of each kind: all around, near the surface, on it, and far away.
 COUNT = 6
-# Of distances, in sizes of the surface: both are sums of some tens of rounded products.
+# Rounding of distances, in sizes of the surface: both are sums of some tens of rounded products.
 ROUNDED = 1e-13
-# Of the part of a way that is along the tangents, in lengths of the way; and what rounding adds to it.
+# Part of a way that is along the tangents, in lengths of the way; and what rounding adds to it.
 ALONG_NORMAL = 1e-9
-# Of parameters: the same steps, but for rounding of sums over other numbers of points.
+# Difference of parameters: the same steps, but for rounding of sums over other numbers of points.
 DESCENT = 1e-12
 # Pieces that may hold the nearest point, for points that are far away.
 FEW_PIECES = 80

@@ -6,7 +6,7 @@ from patches.closed_cages import bumpy, cage_of, mixed_torus, torus
 from peers.fidelity_cages import SURFACES
 from reference.refined_cages import sheet
 
-# Of sums of entries of about one, and of eigenvalues, beside the largest entry.
+# Rounding of sums of entries of about one, and of eigenvalues, relative to the largest entry.
 ROUNDING = 1e-12
 # A millionth of the energy around extraordinary points is left out, and Gauss's rule of order 8 has about as much.
 QUADRATURE = 1e-5

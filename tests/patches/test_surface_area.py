@@ -6,7 +6,7 @@ from mitsuba_subdivision.cage.named_cages import cube
 from patches.closed_cages import bumpy, cage_of, creased
 from reference.refined_cages import sheet, tagged
 
-# Of an area.
+# Relative error of an area.
 EXACT = 1e-10
 # Triangles of 10, 20 and 40 segments, extrapolated twice for errors of second and fourth order. Around extraordinary
 # points and along creases errors are of other orders; measured, up to 2e-7.

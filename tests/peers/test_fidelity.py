@@ -55,7 +55,7 @@ MEANS = 1e4
 # A limit mask of three weights of which two are off by 2e-9, and a border's end by a patch that is an end cap.
 FACE_VARYING_MASK = 1e-6
 
-# Of an error that a subdominant eigenvalue governs, over two levels.
+# What is left over two levels of an error that a subdominant eigenvalue governs.
 APPROACH = 0.4
 
 LEVEL = 6

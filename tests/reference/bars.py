@@ -3,7 +3,7 @@
 # Relative to the size of the cage; derivatives also divided by their size at a level, (2 lambda_2)^n.
 POINT = 1e-13
 DERIVATIVE = 1e-12
-# Of the same, divided by (4 lambda_2)^n: two orders of rounding more than measured.
+# Second derivatives, divided by (4 lambda_2)^n: two orders of rounding more than measured.
 SECOND_DERIVATIVE = 1e-11
 # In degrees.
 NORMAL = 1e-9

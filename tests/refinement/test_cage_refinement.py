@@ -14,9 +14,9 @@ from peers.fidelity_cages import ISLANDS, SURFACES, fan, with_islands
 from reference.exact_samples import angle
 from reference.refined_cages import sheet, tagged
 
-# Of points, derivatives and values, all below ten, or of larger derivatives; measured 4e-14.
+# Rounding of points, derivatives and values below ten, or relative to larger derivatives; measured 4e-14.
 ROUNDING = 1e-12
-# Of normals in degrees, where tangents are at right angles and equally long; measured 3e-12.
+# Error of normals in degrees, where tangents are at right angles and equally long; measured 3e-12.
 NORMAL = 1e-10
 # Tangents that span less of a plane, relative to the longer one, do so by rounding.
 FLAT = 1e-9

@@ -15,7 +15,7 @@ from shapes.variants import printed
 
 LIMITS = Tolerances()
 NOTHING = np.uint32(2**32 - 1)
-# Of a mean of 3,072 squares, and of the variance that few batches measure: five standard deviations and more.
+# Noise of a mean of 3,072 squares, and of the variance that few batches measure: five standard deviations and more.
 NOISE = 0.25
 MIDDLE = np.s_[12:20, 12:20]
 

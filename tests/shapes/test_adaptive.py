@@ -13,7 +13,7 @@ from shapes.variants import every_variant, llvm, scalar
 
 ADAPTIVE = {"tessellation": "adaptive", "max_rate": 32}
 CHORD = Criterion("chord", 1e-2)
-# Of a pixel; closest points are found in double precision, vertices are stored in single precision.
+# Distances in pixels: closest points are found in double precision, vertices are stored in single precision.
 PIXEL = 1e-3
 CAGE = bumpy(named_cages.extraordinary(5))
 EYE = [4.0, -6.0, 4.0]

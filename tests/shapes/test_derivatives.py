@@ -128,7 +128,7 @@ def test_derivatives_of_hits_are_differences(named, by, parameters, shading, np_
         assert np.mean(error > TANGENTS * (size + (np.median(size) or 1))) <= MOST_OTHERS, name
 
 
-# Of sums over vertices, by central differences of numbers in single precision.
+# Step and relative error of central differences of sums over vertices in single precision.
 VERTEX_STEP, VERTEX_DIFFERENCE = 3e-3, 1e-3
 
 

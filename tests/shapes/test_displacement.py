@@ -17,7 +17,7 @@ from shapes.variants import every_ad_variant, every_variant, exact, exact_llvm
 
 # Places and normals in single precision, of a cage of size one; normals take differences of differences.
 SINGLE, NORMAL = 1e-6, 2e-5
-# Of central differences in double precision: the cube root of it.
+# Step of central differences: the cube root of the rounding of double precision.
 STEP = 6e-6
 # Where Newton's method ends in single precision, and what a step of its last size changes there.
 HIT, HIT_NORMAL, HIT_DERIVATIVE = 1e-5, 1e-3, 1e-2
@@ -29,7 +29,7 @@ BESIDE, AROUND = 2.0**-5, 0.04
 RATE, FINE = 5, 24
 SCALE = 0.15
 IMAGE = np.random.default_rng(7).random((5, 8)).astype(np.float32)
-# Of a bitmap's texture coordinates, turned and sheared; and of its three channels, whose luminance is the height.
+# Transformation of a bitmap's texture coordinates; its three channels, and the weights of their luminance, the height.
 TO_UV = np.array([[1.22, -0.34, 0.0], [0.36, 0.89, 0.0], [0.0, 0.0, 1.0]])
 CHANNELS, LUMINANCE = np.array([0.5, 1.0, 1.5]), np.array([0.212671, 0.715160, 0.072169])
 STRETCHED = np.diag([-1.0, 0.8, 1.2, 1.0])
@@ -330,7 +330,7 @@ def test_a_cage_far_from_the_origin_has_the_same_normals():
 TEXELS = IMAGE[:4, :7, None]
 # Second differences over a texel, of values that single precision rounds.
 SECOND = 1e-3
-# Of texture coordinates, several texels.
+# Offset of texture coordinates, several texels.
 SLIDE = 0.02
 
 

@@ -20,7 +20,7 @@ if hook_problem():
 pytestmark = llvm
 
 FINE, RESOLUTION = 12, 32
-# Of pictures of which only the hits are needed.
+# Resolution of pictures of which only the hits are compared.
 EDGE = 64
 # Places and normals in float32, relative to a cage of size one.
 SINGLE = 5e-6

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from mitsuba_subdivision import Attribute, CageWarning, ControlCage, LimitSurface
 from mitsuba_subdivision.files.formats import FORMATS
-from mitsuba_subdivision.shapes import registration, subdivision_shape
+from mitsuba_subdivision.shapes import device_state, subdivision_shape
 from mitsuba_subdivision.shapes.device_state import paused_collection
 from patches.closed_cages import torus
 from reference.refined_cages import tagged
@@ -22,8 +22,8 @@ pytestmark = pytest.mark.threads
 
 # Four frames of Python for each of so many shapes on two threads are more than a stack may have, were they nested.
 MANY = pytest.param(600, True, [{}], marks=pytest.mark.long)
-# Of what takes longer; enough that constructors go on in other threads several times.
-SOME = 3 * registration.DEEPEST
+# Number of shapes whose constructors continue in several other threads.
+SOME = 3 * device_state.DEEPEST
 BUFFERS = ("vertex_positions", "vertex_normals", "vertex_colour", "faces", "face_element")
 # Vertices that were placed at once, or with others: sums in single precision, in another order.
 SINGLE = 1e-6
@@ -97,18 +97,18 @@ def test_an_error_of_one_shape_is_raised_by_the_load():
 def test_a_constructor_too_deep_runs_in_its_own_thread():
     threads, depths = [], []
 
-    @registration.on_shallow_stack
+    @device_state.on_shallow_stack
     def begin(left):
         threads.append(threading.get_ident())
-        depths.append(registration._stack.depth)
+        depths.append(device_state._stack.depth)
         if not left:
             raise KeyError("innermost")
         begin(left - 1)
 
     with pytest.raises(KeyError, match="innermost"):
-        begin(3 * registration.DEEPEST - 1)
+        begin(3 * device_state.DEEPEST - 1)
     assert len(set(threads)) == 3
-    assert depths == 3 * list(range(1, registration.DEEPEST + 1))
+    assert depths == 3 * list(range(1, device_state.DEEPEST + 1))
     # Nothing is left on the stack.
     depths.clear()
     with pytest.raises(KeyError):

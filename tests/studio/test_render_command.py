@@ -207,7 +207,7 @@ def test_an_error_at_a_hit_ends_the_command(folder, capsys, monkeypatch, words):
 
 CUBE = named_cages.cube()
 TINY = ["--size", "20x15", "--spp", "4"]
-# Of the error by as many samples, at most: measured 0.34.
+# Largest part of the error with as many samples; measured 0.34.
 LEFT = 0.6
 
 
@@ -294,4 +294,4 @@ def test_denoised_pictures_are_no_references(capsys):
     assert render("cube.obj", "-o", "a.exr", *TINY, "-m", "scalar_rgb", "--denoise") == 0
     assert load_image("a.exr").metadata["denoised"]
     assert main(["compare", "a.exr", "a.exr"]) == 3
-    assert '"a.exr" is denoised, which removes what is compared; expected one as rendered' in capsys.readouterr().err
+    assert '"a.exr" is denoised; expected the render with its noise' in capsys.readouterr().err

@@ -9,9 +9,9 @@ from reference.refined_cages import refine_first, tagged
 pytestmark = pytest.mark.core
 
 EVERY_SURFACE = pytest.mark.parametrize("name", SURFACES)
-# Of sums of some tens of terms; around vertices of valence 50 of ill-conditioned eigenvectors.
+# Rounding of sums of some tens of terms; around vertices of valence 50 of ill-conditioned eigenvectors.
 ROUNDED, NORMAL = 1e-13, 1e-10
-# Of derivatives, in sums of the absolute values of their terms where these are above one.
+# Rounding of derivatives, in sums of the absolute values of their terms where these are above one.
 DERIVATIVE = 1e-12
 
 

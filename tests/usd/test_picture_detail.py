@@ -220,8 +220,10 @@ def test_few_or_too_large_instances_stay_and_large_ones_warn_with_numbers(monkey
     shape, notes = cube_shape(), StageWarnings()
     few, contents = (scene(group=[shape], count=count) for count in (LEAST_INSTANCES - 1, COUNT))
     assert copied(few) == (few, {})
-    monkeypatch.setattr(copies, "MOST_BYTES", 1)
-    assert copied(contents, rates_of(shape), notes=notes) == (contents, {})
+    # None where the system does not report it
+    for available, are_copied in ((None, True), (1, False)):
+        monkeypatch.setattr(copies, "available_memory", lambda available=available: available)
+        assert bool(copied(contents, rates_of(shape), notes=notes)[1]) is are_copied
     with pytest.warns(UserWarning, match=rf"copies with {6 * COUNT:,} faces .* GB, and stay {COUNT} instances"):
         notes.warn("stage")
 
@@ -283,7 +285,7 @@ DISTANCE = 10.0
 LEVEL = 1.01 / 255
 # The depth of a flat square is known but for single precision.
 ROUNDED = 1e-5
-# Of 255. Chroma of neighbouring pixels is interpolated before a full image is halved.
+# In steps of 8-bit values. Chroma of neighbouring pixels is interpolated before a full image is halved.
 JPEG_LEVELS = 4
 
 

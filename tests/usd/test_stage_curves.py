@@ -15,7 +15,7 @@ from usd.stages import bound, camera, material, moved, prim, shader, told, write
 
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 
-# Of two ways to a point in double precision; and part of a radius within which rays hit or miss in single precision.
+# Distance of equal points in double precision; part of a radius within which rays hit or miss in single precision.
 ROUNDING, EDGE = 1e-12, 0.01
 PLACES = np.linspace(0, 1, 5)
 # Points of each segment's Bezier form, of those around it.

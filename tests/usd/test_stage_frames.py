@@ -24,7 +24,7 @@ from shapes.variants import exact, scalar
 from usd import stages
 from usd.stages import CUBE, FACES, POINTS, POLYGONS, SQUARE, bound, material, mesh, moved, prim, subset, texture
 
-# Of stages, parts move from time 1 to time 5.
+# Parts of stages move from time 1 to time 5.
 RAISED = "(-1,-1,-1), (1,-1,-1), (-1,1,-1), (1,1,-1), (-.3,-.3,3), (.3,-.3,3), (-.3,.3,3), (.3,.3,3)"
 COLORS = "(1,0,0), (0,1,0), (0,0,1), (1,1,0), (1,0,1), (0,1,1), (1,1,1), (0,0,0)"
 MOVING = prim("Mesh", "moving", f"point3f[] points.timeSamples = {{1: [{stages.CORNERS}], 5: [{RAISED}]}}", FACES)

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("variant_llvm_ad_rgb")
 MATERIALX = ("standard_surface", "open_pbr_surface", "gltf_pbr")
 COLOR = [0.2, 0.4, 0.8]
 COPPER = [0.955, 0.638, 0.538]
-# Of means of 65,536 samples whose lobes are chosen by other odds.
+# Relative noise of means of 65,536 samples whose lobes are chosen with other probabilities.
 SAMPLED = 0.02
 # Media have finite densities.
 ABSORBED = 1e-3
@@ -244,7 +244,7 @@ def test_anisotropy_is_the_ratio_of_widths_and_turns_by_quarters(model, given, w
 
 COATED = {"base_metalness": 1.0, "base_color": COPPER, "coat_weight": 1.0}
 TURNED = {"metalness": 1.0, "specular_anisotropy": 0.5, "specular_rotation": 0.1}
-# Of materials, what is told, or nothing.
+# Materials, and the warning about each, or None.
 TOLD = [
     ("open_pbr_surface", {**COATED, "specular_color": [1.0, 1.0, 1.0]}, None),
     ("open_pbr_surface", {**COATED, "specular_color": [0.6] * 3, "fuzz_weight": 1.0}, "edge colours"),

@@ -13,7 +13,7 @@ from usd.stages import CUBE, POLYGONS, bound, flat, material, mesh, prim, shader
 pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 POINTS, COUNTS, VERTICES = CUBE.splitlines()
 
-# Of a cube, in other units than the names of the attributes: how many values there are.
+# Numbers of values of a cube's attributes, by interpolation.
 COUNT = {"constant": 1, "uniform": 6, "vertex": 8, "varying": 8, "faceVarying": 24}
 # Read texture coordinates and a colour of the mesh.
 SPECULAR = "int inputs:useSpecularWorkflow = 1\ncolor3f inputs:{}.connect = </{}.outputs:{}>"

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.usefixtures("variant_scalar_rgb")
 
 # The largest light is 5 units wide at a distance of 7: what its sides send comes from farther away, and at an angle.
 AREA_LIGHT = 0.15
-# Of 256 samples in 16 pixels.
+# Relative noise of the mean of 256 samples in each of 16 pixels.
 LAMPS_NOISE = 0.02
 CAMERA = camera()
 SKY = prim("DomeLight", "sky")
@@ -205,7 +205,7 @@ def test_differing_instances_look_like_differing_prims(scene, difference):
 
 
 ST = [(0, 0), (1, 0), (1, 1)]
-# Of prims of these kinds: attributes with a value and another one.
+# Attributes of prims of these kinds, with a value and another one.
 VALUES = {
     "Camera": {
         "double3 xformOp:translate": ((0, 0, 10), (0, 0, 20)),
@@ -411,7 +411,7 @@ def test_glowing_surfaces_do_not_count_as_lamps(scene):
 QUADRANTS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], dtype=np.uint8)
 READER = "</paint/reader.outputs:result>"
 GLOW = "color3f inputs:emissiveColor.connect = </paint/texture.outputs:rgb>\ncolor3f inputs:diffuseColor = (0, 0, 0)"
-# Of normals in pictures.
+# Scale and bias of pictures of normals.
 FROM_BYTES = "float4 inputs:scale = (2, 2, 2, 1)\nfloat4 inputs:bias = (-1, -1, -1, 0)"
 
 

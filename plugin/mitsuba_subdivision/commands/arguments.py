@@ -28,7 +28,7 @@ def add_cage_options(parser: argparse._ActionsContainer, default_rate: str) -> N
     add = parser.add_argument
     add("--scheme", help=f"one of {', '.join(BUILT_IN)} (default: the file's, otherwise catmull_clark)")
     add("--prim", metavar="PATH", help="mesh of a USD file that has several: its path, or * for all meshes as one cage")
-    add("--time", type=float, help="time code of a USD file (default: the first)")
+    add("--time", type=float, help="time code of a USD file (default: values without time, or the first)")
     add("--rate", type=rate, metavar="N", help=f"segments per edge of the cage (default: {default_rate})")
 
 

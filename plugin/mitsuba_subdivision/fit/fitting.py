@@ -33,7 +33,7 @@ Schedulable = float | Sequence[tuple[float, float]] | Callable[[int], float]  # 
 
 
 class Fit(ABC):
-    """The base of `CageFit` and `PointFit`, which have these parameters.
+    """Base class of `CageFit` and `PointFit`.
 
     Attributes
     ----------

@@ -85,7 +85,7 @@ class AffineMap:
     def of(cls, matrix: Matrix4, inverse: Matrix4 | None = None) -> AffineMap:
         """The map of a 4x4 matrix of Dr.Jit or NumPy, whose last row is ignored.
 
-        A missing inverse is computed, and is differentiable.
+        Of ``inverse``, only the linear part is read; a missing one is computed, and is differentiable.
         """
         rows = _rows(matrix)
         return cls(rows, [matrix[i, 3] for i in range(3)], _inverse(rows) if inverse is None else _rows(inverse))

@@ -202,7 +202,7 @@ def piece_hits(
 def _repeated(step: Callable[[Any], Any], start: Any, is_active: Callable[..., Mask], label: str) -> Any:
     """Repeat a step from a state while a condition of its numbers holds: a loop over the numbers in the state.
 
-    Dr.Jit takes three times as long to find them in objects. The state ends with a vector, and a tuple of vectors.
+    Dr.Jit takes longer to find them in objects. The state ends with a vector, and a tuple of vectors.
     """
     make, vector, count = type(start), type(start.d), len(start) - 2
 

@@ -1,6 +1,6 @@
 """Comparison of renders: rendering by passes, references, and tiers that compare images with them.
 
-The glossary of plugin/ARCHITECTURE.md has the words. The modules `image`, `tiers`, `compare` and `report` do not use
+The glossary of plugin/ARCHITECTURE.md has its terms. The modules `image`, `tiers`, `compare` and `report` do not use
 Mitsuba, and compare renders of any origin.
 """
 

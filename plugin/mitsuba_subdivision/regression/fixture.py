@@ -25,7 +25,7 @@ from . import ContentElsewhere, RegressionError, renders
 from .compare import Comparison
 from .image import Image, load_image, save_image
 from .report import NUMBERS, write_report
-from .scene import BOX, SceneSource, load_scene
+from .scene import BOX, GivenScene, load_scene
 from .tiers import Status, Tolerances
 
 # Scenes of a reference, by its path: text of the scene, and the test that renders it.
@@ -50,7 +50,7 @@ class RenderRegression:
 
     def __call__(
         self,
-        scene: SceneSource,
+        scene: GivenScene,
         *,
         name: str | None = None,
         parameters: Mapping[str, Any] | None = None,
@@ -149,7 +149,7 @@ class RenderRegression:
             report += f'\nwrote the reference "{path}" again'
         pytest.fail(f"{comparison}{report}", False)
 
-    def _located(self, scene: SceneSource) -> SceneSource:
+    def _located(self, scene: GivenScene) -> GivenScene:
         if not isinstance(scene, (str, Path)):
             return scene
         folders = dict.fromkeys([self.node.path.parent, self.node.config.rootpath])
@@ -158,7 +158,7 @@ class RenderRegression:
             pytest.fail(f'scene "{scene}" is not a file in {" or ".join(map(str, folders))}', False)
         return Path(os.path.relpath(found)) if found.is_relative_to(Path.cwd()) else found
 
-    def _path_of_reference(self, scene: SceneSource, name: str | None, settings: _Settings) -> Path:
+    def _path_of_reference(self, scene: GivenScene, name: str | None, settings: _Settings) -> Path:
         if name is not None:
             if not re.fullmatch(r"[\w.-]+", name):
                 raise RegressionError(f'reference name "{name}"; expected letters, digits, ".", "_" and "-" only')
@@ -175,7 +175,7 @@ class RenderRegression:
                     return old
         return path
 
-    def _claim(self, path: Path, scene: SceneSource, settings: _Settings) -> None:
+    def _claim(self, path: Path, scene: GivenScene, settings: _Settings) -> None:
         """Fail if another scene of this run has the same reference; record this one for pytest's summary."""
         words = f"{scene if isinstance(scene, Path) else 'a scene in memory'}{_suffix(settings)}"
         other, test = self.node.config.stash.setdefault(CLAIMS, {}).setdefault(path, (words, self.node.nodeid))
@@ -191,7 +191,7 @@ class RenderRegression:
             self.node.user_properties.append(("render_undecided", f"{name}: {line}"))
             warnings.warn(RenderWarning(f"{name}: {line}"), stacklevel=3)
 
-    def _report(self, comparison: Comparison, name: str, scene: SceneSource, path: Path) -> str:
+    def _report(self, comparison: Comparison, name: str, scene: GivenScene, path: Path) -> str:
         """Write a report if the settings request one, in place of an earlier one; returns a line with its path."""
         folder = self.results / re.sub(r"[^\w.-]+", "-", f"{self.node.nodeid}-{name}").strip("-")
         if (folder / NUMBERS).is_file():
@@ -228,7 +228,7 @@ def _scene_of(metadata: dict[str, Any], path: Path) -> Path | None:
     return scene if scene is not None and scene.is_file() else None
 
 
-def _require_same_scene(reference: Image, path: Path, scene: SceneSource, settings: _Settings) -> None:
+def _require_same_scene(reference: Image, path: Path, scene: GivenScene, settings: _Settings) -> None:
     """Fail if a reference shows another scene; raise UnusableReference if it has other parameters."""
     other = _scene_of(reference.metadata, path)
     if other and isinstance(scene, Path) and other != scene.resolve():

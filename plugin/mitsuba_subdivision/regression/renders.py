@@ -24,7 +24,7 @@ from ..variants import environment, variant_problem
 from . import ContentElsewhere, RegressionError
 from .compare import Comparison, compare
 from .image import NOTHING, Estimate, Image, Probe, combine, load_image, require_finite
-from .scene import SEEDS, LoadedScene, SceneSource, load_scene, render_pixels
+from .scene import SEEDS, GivenScene, LoadedScene, load_scene, render_pixels
 from .tiers import Status, Tolerances
 
 BATCH = 64  # Samples per pixel of a batch
@@ -265,7 +265,7 @@ def variant_for(reference: Image) -> str:
 
 
 def render_like(
-    reference: Image, source: SceneSource, spp: int = TEST_SPP, seed: int = 0, *, second_attempt: bool = False
+    reference: Image, source: GivenScene, spp: int = TEST_SPP, seed: int = 0, *, second_attempt: bool = False
 ) -> Image:
     """Render a scene in the current variant with the settings of a reference, but other samples for each seed.
 
@@ -282,7 +282,7 @@ def render_like(
     return replace(test, paired=pair.paired, probe=pair.probe, metadata=metadata)
 
 
-def _load_like(reference: Image, source: SceneSource) -> LoadedScene:
+def _load_like(reference: Image, source: GivenScene) -> LoadedScene:
     made = reference.metadata
     loaded = load_scene(source, made.get("parameters"), made.get("filter"), made.get("sensor", 0))
     if loaded.size != reference.size:
@@ -293,13 +293,13 @@ def _load_like(reference: Image, source: SceneSource) -> LoadedScene:
 
 def compare_scene(
     reference: Image,
-    source: SceneSource,
+    source: GivenScene,
     tiers: Sequence[str] | None = None,
     spp: int = TEST_SPP,
     tolerances: Tolerances | None = None,
     suite_size: int = 1,
     seed: int = 0,
-    missing: str = "warn",  # As of `compare`
+    missing: str = "warn",  # As in `compare`
 ) -> Comparison:
     """Render a scene as its reference was, in the current variant, and `compare` the two.
 

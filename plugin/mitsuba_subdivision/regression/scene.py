@@ -21,7 +21,7 @@ from .image import without_sample_counts
 BOX = "box"
 
 # Path of an XML file, dictionary, or mi.Scene. As text, as Mitsuba has no classes before a variant is set.
-SceneSource = Union[str, Path, Mapping[str, Any], "mi.Scene"]
+GivenScene = Union[str, Path, Mapping[str, Any], "mi.Scene"]
 # Samples of a part, and least samples per pixel: with fewer, weights of a wide filter would differ between parts.
 PART_SAMPLES = 1 << 22
 LEAST_PART_SPP = 16
@@ -75,7 +75,7 @@ class LoadedScene:
 
 @timed("Loading shapes and their hierarchy")
 def load_scene(
-    source: SceneSource,
+    source: GivenScene,
     parameters: Mapping[str, Any] | None = None,
     filter_name: str | None = None,
     sensor_index: int = 0,

@@ -41,6 +41,7 @@ RESERVED = ("positions", "normals")
 # Numbers of components that Mitsuba's attribute lookups support.
 WIDTHS = (1, 3)
 
+# Mitsuba's table of the coefficients of spectra, by sRGB.
 TABLE = "data/srgb.coeff"
 # Sizes in bytes of the magic number at the beginning of the file, and of the resolution that follows.
 _MARK, _WORD = 4, 4
@@ -67,7 +68,7 @@ class CageAttributes:
         # What takes new values of attributes
         channels: dict[str, ChannelKernel],  # Attributes that are evaluated at hits
         displacement: ShapeDisplacement | None,
-        # Of `retessellate`
+        # Arguments of `retessellate`
         triangles: Triangles,
         names_at_vertices: Container[str],
         # Method that is called with an attribute's name and the gradient by its values, by the same name, after reverse
@@ -96,7 +97,7 @@ class CageAttributes:
         self._upsampling = spectral_upsampling(variant, sizes)
         # Updated values of attributes, as watched for reverse-mode passes.
         self._moved: dict[str, FloatBuffer] = {}
-        # Older than any values of the parameters that are differentiated.
+        # Made before any values of the parameters that are differentiated: each must be older than what it watches.
         self._passes = {
             name: BackwardPasses(self._source, f"{PREFIX}{name}", variant.Float)
             for name in (self._channels if dr.is_diff_v(variant.Float) else ())

@@ -1,4 +1,4 @@
-"""Values of Mitsuba's objects, and support of shapes for frozen functions (``@dr.freeze``).
+"""Values of Mitsuba's objects, what threads must not do in them, and support of frozen functions (``@dr.freeze``).
 
 A frozen function must know every array that it reads. Dr.Jit finds the arrays that are attributes of a Python shape,
 but does not search objects of other classes. The first call records kernels, which later calls run without Python. So
@@ -8,10 +8,13 @@ while a function is recorded, values are neither read back nor checked, and all 
 from __future__ import annotations
 
 import gc
+import threading
 import weakref
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from functools import cache
+from contextvars import copy_context
+from functools import cache, wraps
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,6 +24,11 @@ import numpy as np
 from ..device_arrays import take_over
 from ..kernels.array_types import FloatBuffer, arrays_in
 from ..variants import Variant
+
+# Maximum number of nested constructors on one stack. Each takes 4 to 15 of the thousand frames that Python allows, and
+# less than 8 kB of a stack of at least half a megabyte.
+DEEPEST = 32
+_stack = threading.local()
 
 
 @contextmanager
@@ -39,13 +47,39 @@ def paused_collection() -> Iterator[None]:
             gc.enable()
 
 
+def on_shallow_stack(function: Callable[..., None]) -> Callable[..., None]:
+    """Decorate a constructor of shapes to run in a new thread if `DEEPEST` are already on this thread's stack.
+
+    Mitsuba loads the shapes of a scene as tasks of Dr.Jit's thread pool. A thread that waits for Dr.Jit runs other
+    queued tasks on the same stack: all constructors of other shapes, before any kernel. Waiting cannot be avoided, as
+    `Mesh.parameters_changed` waits for the mesh's bounding box. So a thousand constructors would be nested in each
+    other. The caller of one that runs in a new thread waits for this thread without running tasks.
+    """
+
+    @wraps(function)
+    def call(*arguments: Any) -> None:
+        depth = getattr(_stack, "depth", 0)
+        if depth >= DEEPEST:
+            with ThreadPoolExecutor(1) as thread:
+                # Raises an error of the function, and keeps no reference to it.
+                thread.submit(copy_context().run, call, *arguments).result()
+            return
+        _stack.depth = depth + 1
+        try:
+            function(*arguments)
+        finally:
+            _stack.depth = depth
+
+    return call
+
+
 class DeferredCollection:
     """Defers garbage collections from the first hit that a kernel traces to the launch of the kernel.
 
     A collection may free another scene. If one comes between two virtual function calls of a kernel, Dr.Jit numbers the
     instances of the second call anew, and may define a function twice, which ends the process. Python collects once
-    the number of new objects exceeds a threshold. A step of prb leaves ten times as many with hits that are traced in
-    Python as with those of `mi.Mesh`. So the count starts again after each hit: the threshold is raised until the next
+    the number of new objects exceeds a threshold. A step of prb leaves many more with hits that are traced in Python
+    than with those of `mi.Mesh`. So the count starts again after each hit: the threshold is raised until the next
     collection, or until the first hit after a launch.
     """
 

@@ -225,7 +225,7 @@ class DisplacedVertices:
         return positions.ravel(), normals.ravel()
 
     def _sampler(self, points: FloatArray) -> PatchSampler:
-        return PatchSampler(self._surface.patches, points, self._surface.cage.cut_mesh.vertex)
+        return PatchSampler(self._surface.patches, points)
 
 
 def _mean_over_copies(weld_target: NDArray[np.uint32]) -> sparse.csr_array:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ..kernels.channel_kernel import ChannelKernel
     from .mesh_buffers import Triangles
 
-# Length of the rays to points of outlines, in which projective integrators compute the radiance beside these.
+# Distance at which projective integrators begin rays to points of outlines: hits at just this distance are of these.
 OUTLINE = 1
 # Cosine of the angle between a ray and the normals that `_turned_to_ray` turns to a silhouette.
 GRAZING = 1e-2

@@ -14,9 +14,9 @@ def make_foreground(variant: Variant) -> type:
     is_scalar = variant.Float is float
 
     class Foreground(variant.SamplingIntegrator):
-        """Takes the integrator ``shown`` where a ray of the camera first hits a mesh that emits light.
+        """Uses the integrator ``shown`` where a ray of the camera first hits a mesh that emits light.
 
-        For all else ``hidden``, which has the parameter ``hide_emitters``: alone, it would hide such meshes as well.
+        Elsewhere it uses ``hidden``, whose parameter ``hide_emitters`` would hide such meshes as well.
         """
 
         def __init__(self, props: Any) -> None:

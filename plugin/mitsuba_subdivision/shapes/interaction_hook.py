@@ -66,8 +66,7 @@ _ANSWERED_UV, _VALUE = (8, 9), (10, 11, 12)
 # Names of its triangle's attributes, and their numbers of components.
 _ATTRIBUTES = {"face_one": 1, "face_three": 3}
 
-# Hooks by variant. Never removed, because shapes use the functions for their whole lifetime.
-# Hooks of variants, or reasons for which these have none: the trial takes a tenth of a second.
+# The hook of each variant, or the reason why it has none. Never removed, as shapes use its functions.
 _hooks: dict[Variant, InteractionHook | str] = {}
 _collection = DeferredCollection()
 # Mitsuba constructs the shapes of a scene in parallel.
@@ -188,7 +187,7 @@ class InteractionHook:
         if answers is None or (tag and tag not in self._tags[answers]):
             return
         variant = self._variant
-        # Equal operations are few, and searching for them takes a tenth of the time of tracing.
+        # Equal operations are few, and searching for them takes longer than it saves.
         with _collection.while_tracing(), dr.scoped_set_flag(dr.JitFlag.ValueNumbering, False):
             answers.complete(
                 object_at(variant.SurfaceInteraction3f, result),

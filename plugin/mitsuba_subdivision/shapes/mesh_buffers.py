@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from .exact_shading import ExactShading
     from .parameters import Parameters
 
-# Largest number of vertices of loaded control points that shapes of equal cages share, in object space: few take longer
-# to trace than to compute, and more take memory.
+# Largest number of vertices, in object space and of loaded control points, that shapes of equal cages share. Small
+# shapes take longer to trace than to compute; vertices of large ones would take memory.
 MOST_SHARED = 1 << 16
 
 
@@ -44,7 +44,7 @@ class Triangles(NamedTuple):
 
 
 class MeshBuffers:
-    """Triangles of a shape, and positions and normals in world space, which also update exact shading and placement.
+    """Triangles of a shape, and its vertices in world space; updates exact shading with them.
 
     Surfaces are evaluated in object space, relative to the centre of the loaded control points, and then mapped to
     world space. Arrays are Dr.Jit arrays, or NumPy arrays in scalar variants.

@@ -164,8 +164,8 @@ vertex_positions : float[]; exposed, differentiable, discontinuous
 vertex_normals : float[]; exposed, differentiable, discontinuous
     Normals of the tessellation, likewise; none with ``face_normals`` or exact shading.
 vertex_texcoords : float[]; exposed, differentiable
-    Texture coordinates of the tessellation; none with exact shading. Updates of ``cage_texcoords`` overwrite assigned
-    values.
+    Texture coordinates of the tessellation; with exact shading only for textured emitters. Updates of
+    ``cage_texcoords`` overwrite assigned values.
 vertex_NAME : float[]; exposed, differentiable
     Mesh attribute: an attribute's values at the tessellation's vertices. Updates of ``cage_NAME`` overwrite them.
 face_element : float[]; exposed, differentiable

@@ -56,7 +56,7 @@ _WARNINGS: WeakKeyDictionary[ControlCage, list[str]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)
-class Tessellation:
+class TessellationChoice:
     """The same number of segments on every edge of the cage, or as few triangles as an error limit allows."""
 
     rate: int  # Number of segments along an edge of the cage; the largest one of an adaptive tessellation
@@ -82,7 +82,7 @@ class Tessellation:
         with errors_about(self.limit):
             return surface.adaptive_sampling(criterion, self.rate, world_points)
 
-    def with_error(self, error: NDArray[np.floating]) -> Tessellation:
+    def with_error(self, error: NDArray[np.floating]) -> TessellationChoice:
         """Return the tessellation with another value of the limit, an array of one number.
 
         Raises ValueError if the array has another size, or the number is not above 0.
@@ -107,7 +107,7 @@ class Parameters:
     surface: LimitSurface  # In object space
     source: str  # Name of the cage or of its file, or "control cage", at the beginning of messages
     to_world: NDArray[np.float64]  # (4, 4) float64
-    tessellation: Tessellation
+    tessellation: TessellationChoice
     shading: str
     face_normals: bool
     evaluator: Evaluator
@@ -166,8 +166,9 @@ def read_parameters(props: mi.Properties) -> Parameters:
         source = os.path.basename(str(props["filename"]))
     surface = LimitSurface(cage, scheme)
     shown = _shown(props, surface)
-    form = shading, face_normals, evaluator, offset
-    return Parameters(surface, source, to_world, tessellation, *form, displacement, scale, shown)
+    return Parameters(
+        surface, source, to_world, tessellation, shading, face_normals, evaluator, offset, displacement, scale, shown
+    )
 
 
 def _shown(props: mi.Properties, surface: LimitSurface) -> NDArray[np.bool_] | None:
@@ -220,12 +221,12 @@ def ranges_as_text(numbers: IntArray) -> str:
     return " ".join(f"{part[0]}-{part[-1]}" if len(part) > 1 else str(part[0]) for part in ranges if len(part))
 
 
-def _tessellation(props: mi.Properties) -> Tessellation:
+def _tessellation(props: mi.Properties) -> TessellationChoice:
     if value_of(props, "tessellation") == "uniform":
         adaptive_only = [name for name in ADAPTIVE if name in props]
         if adaptive_only:
             raise ValueError(f'parameter "{adaptive_only[0]}" needs "tessellation" = "adaptive"')
-        return Tessellation(value_of(props, "tessellation_rate"))
+        return TessellationChoice(value_of(props, "tessellation_rate"))
     if "tessellation_rate" in props:
         raise ValueError(
             'parameter "tessellation_rate" needs "tessellation" = "uniform"; expected "max_rate", the highest rate of '
@@ -248,7 +249,7 @@ def _tessellation(props: mi.Properties) -> Tessellation:
         sensor if is_of_pixels else None,
         sensor if fits_outline else None,
     )
-    return Tessellation(value_of(props, "max_rate"), limit, criterion)
+    return TessellationChoice(value_of(props, "max_rate"), limit, criterion)
 
 
 def _sensor(props: mi.Properties, needed_by: str | None) -> Sensor | None:
@@ -481,7 +482,7 @@ def pixel_error_for(sensor: mi.Sensor, pixel_error: float | None = 0.5, *, outli
     parameters = mi.traverse(sensor) if isinstance(sensor, mi.Sensor) else {}
     if "x_fov" in parameters:
         fov = float(np.ravel(np.array(parameters["x_fov"]))[0])
-    elif "rthographic" in kind:
+    elif "orthographic" in kind.lower():
         fov = 0.0
     else:
         raise ValueError(f"sensor {kind}; expected a loaded perspective, thinlens or orthographic sensor")

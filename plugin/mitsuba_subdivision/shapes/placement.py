@@ -58,7 +58,7 @@ class Placement:
         self,
         positions: NDArray[np.float64],  # (n, 3) float64: loaded control points
         float_type: type,  # Flat Dr.Jit array of the parameter ``control_points``
-        # Of `update`
+        # Arguments of `update`
         to_world: mi.AffineTransform4f,
         value: NDArray[np.float64],
         *,

@@ -1,25 +1,14 @@
-"""Registration of the plugins of this package for every variant of Mitsuba, and limits of nested shape constructors.
+"""Registration of the plugins of this package for every variant of Mitsuba.
 
 A plugin is registered for one variant, and must be a class of this variant: with a class of another variant, Mitsuba
 silently builds a scene without shapes.
-
-Mitsuba loads the shapes of a scene as tasks of Dr.Jit's thread pool. A thread that waits for Dr.Jit runs other queued
-tasks on the same stack: all constructors of other shapes, before any kernel. Waiting cannot be avoided, because
-`Mesh.parameters_changed` waits for the mesh's bounding box. So a thousand constructors would be nested in each other.
-With `on_shallow_stack`, a constructor that would be nested too deeply runs in a new thread, and its caller waits for
-this thread without running tasks.
 """
 
 from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from contextvars import copy_context
-from functools import wraps
 from types import ModuleType
-from typing import Any
 
 import mitsuba as mi
 
@@ -35,10 +24,6 @@ QUERY_VARIANT = "scalar_rgb"
 _registered: dict[str, type] = {}
 # Re-entrant, because creating the class may switch variants in a callback of another module.
 _lock = threading.RLock()
-# Maximum number of nested constructors on one stack. Each takes 4 to 15 of the thousand frames that Python allows, and
-# less than 8 kB of a stack of at least half a megabyte.
-DEEPEST = 32
-_stack = threading.local()
 
 
 def register() -> None:
@@ -91,23 +76,3 @@ def _on_variant_change(_old: str | None, new: str | None) -> None:
         # Variants are loaded when they are first set or accessed; loading all of them would take seconds.
         if f"mitsuba.{variant}" in sys.modules:
             register_variant(variant)
-
-
-def on_shallow_stack(function: Callable[..., None]) -> Callable[..., None]:
-    """Decorate a function to run in a new thread if `DEEPEST` calls are already on this thread's stack."""
-
-    @wraps(function)
-    def call(*arguments: Any) -> None:
-        depth = getattr(_stack, "depth", 0)
-        if depth >= DEEPEST:
-            with ThreadPoolExecutor(1) as thread:
-                # Raises an error of the function, and keeps no reference to it.
-                thread.submit(copy_context().run, call, *arguments).result()
-            return
-        _stack.depth = depth + 1
-        try:
-            function(*arguments)
-        finally:
-            _stack.depth = depth
-
-    return call

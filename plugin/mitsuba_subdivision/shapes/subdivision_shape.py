@@ -17,13 +17,20 @@ from ..mesh.shared import forget
 from ..surface import TEXCOORDS
 from ..variants import Variant
 from .cage_attributes import PREFIX, WIDTHS, CageAttributes, mesh_attributes, mesh_name
-from .device_state import DeviceState, flat_type, is_recording, paused_collection, require_values, traversed
+from .device_state import (
+    DeviceState,
+    flat_type,
+    is_recording,
+    on_shallow_stack,
+    paused_collection,
+    require_values,
+    traversed,
+)
 from .mesh_buffers import MeshBuffers, Triangles
 from .outlines import seen_edges
 from .parameter_table import errors_about, plugin_page
-from .parameters import Parameters, Tessellation, read_parameters
+from .parameters import Parameters, TessellationChoice, read_parameters
 from .placement import Placement, checked_matrix
-from .registration import on_shallow_stack
 
 if TYPE_CHECKING:
     from ..kernels.channel_kernel import ChannelKernel
@@ -83,8 +90,10 @@ def make_subdivision(
             # The limit of an adaptive tessellation
             self._error = kind([0.0 if criterion is None else criterion.error])
 
-            recentres, placed = parameters.evaluator == "stabilized", (self.to_world, parameters.to_world)
-            self._placement = Placement(surface.cage.positions, kind, *placed, recentres=recentres)
+            recentres = parameters.evaluator == "stabilized"
+            self._placement = Placement(
+                surface.cage.positions, kind, self.to_world, parameters.to_world, recentres=recentres
+            )
             # The attributes that are evaluated at hits, and the surface of hits and of displaced normals
             channels: dict[str, ChannelKernel] = {}
             if is_exact and surface.attribute_names:
@@ -115,17 +124,19 @@ def make_subdivision(
                 from .exact_shading import ExactShading
                 from .interaction_hook import interaction_hook
 
-                shown = channels, self._placement, triangles
-                self._exact = ExactShading(variant, self, surface.cage.source.name, on_device, *shown)
+                name = surface.cage.source.name
+                self._exact = ExactShading(variant, self, name, on_device, channels, self._placement, triangles)
                 interaction_hook(variant).attach(self, self._exact)
             attributes = mesh_attributes(surface.cage)
             exposed = [name for name in (TEXCOORDS, *attributes) if name in surface.attribute_names]
-            vertices = triangles, self._at_vertices
+            renew = WeakMethod(self.renew_attribute)
             self._cage = CageAttributes(
-                variant, surface, exposed, channels, self._displacement, *vertices, WeakMethod(self.renew_attribute)
+                variant, surface, exposed, channels, self._displacement, triangles, self._at_vertices, renew
             )
-            drawn = on_device, self._exact, self._displacement, triangles
-            self._mesh = MeshBuffers(variant, parameters, self._placement, *drawn, WeakMethod(self.renew_derivatives))
+            on_backward = WeakMethod(self.renew_derivatives)
+            self._mesh = MeshBuffers(
+                variant, parameters, self._placement, on_device, self._exact, self._displacement, triangles, on_backward
+            )
             self._device_state = DeviceState(self) if is_jit else None
             # Empty, because Mitsuba would convert values from a list one by one. `_assemble` sets the buffers.
             self.add_attribute("face_element", 1, [])
@@ -243,11 +254,11 @@ def make_subdivision(
             # With the moved buffers among the keys, Mitsuba does not replace normals by averages of triangle normals.
             super().parameters_changed([*keys, *map(mesh_name, attributes), *_MOVED])
 
-        def _checked(self, keys: list[str]) -> tuple[NDArray[np.float64] | None, Tessellation]:
+        def _checked(self, keys: list[str]) -> tuple[NDArray[np.float64] | None, TessellationChoice]:
             """Check the parameters with the names ``keys``.
 
-            Returns the matrix of ``to_world``, None if it is not among these or cannot be read, and the tessellation,
-            another one if its limit is among these.
+            Returns the matrix of ``to_world``, or None if ``keys`` lacks it or it cannot be read; and the tessellation,
+            with a new limit if ``keys`` has one.
             """
             # Mitsuba reads as many values of vertex buffers that a user has assigned as before.
             names = [name for name in self._lengths if name in keys and name.startswith("vertex_")]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..cage import ControlCage
 from ..messages import print_remark
 from ..mitsuba_mesh import box_corners, points_at
-from ..regression.scene import BOX, LoadedScene, SceneSource, load_scene, render_image, render_pixels
+from ..regression.scene import BOX, GivenScene, LoadedScene, load_scene, render_image, render_pixels
 from ..shapes.interaction_hook import exact_shading_problem
 from ..shapes.parameter_table import SHADINGS
 from ..shapes.parameters import pixel_error_for
@@ -23,7 +23,7 @@ from .studio_entries import variant_in_use
 # Largest distance of triangles from the surface in pixels, by shading. With exact shading, only silhouettes show it.
 ERRORS = {"exact": 0.1, "vertex": 0.5 / 4**2}
 # Quantile of vertices for the estimated error: it overestimates borders and creases, and few vertices are at outlines.
-MOST_VERTICES = {"exact": 0.95, "vertex": 0.99}
+VERTEX_QUANTILE = {"exact": 0.95, "vertex": 0.99}
 MOST_SEGMENTS, FINEST_RATE = 8, 64  # Most segments on each edge of a cage: of uniform and of adaptive tessellations
 # Most triangles of a scene; and the number of uniform triangles that take as long as choosing adaptive ones.
 MOST_TRIANGLES, FEW_TRIANGLES = 4_000_000, 20_000
@@ -104,7 +104,7 @@ def _deviation(cage: ControlCage, shading: str) -> float:
         at_corners = x[t.face_vertices]
         around = np.bincount(t.face_vertices, (at_corners[t.next] + at_corners[t.prev]) / 2, cage.vertex_count)
         squared += np.square(around[used] / t.vertex_face_count[used] - x[used])
-    return float(np.sqrt(np.quantile(squared, MOST_VERTICES[shading])) / 2)
+    return float(np.sqrt(np.quantile(squared, VERTEX_QUANTILE[shading])) / 2)
 
 
 def pixels_of_copies(
@@ -192,7 +192,7 @@ def require_denoiser() -> None:
 
 
 def render_denoised(
-    scene: SceneSource, spp: int | None = None, seed: int = 0, parameters: dict[str, object] | None = None
+    scene: GivenScene, spp: int | None = None, seed: int = 0, parameters: dict[str, object] | None = None
 ) -> NDArray[np.float32]:
     """Render a scene with the box filter, and remove its noise by Open Image Denoise.
 

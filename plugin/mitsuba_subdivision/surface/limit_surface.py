@@ -335,7 +335,7 @@ class LimitSurface:
     def closest_point(self, points: ArrayLike) -> ClosestPoints:
         """Find the nearest point of the surface for each given point; where several are nearest, one of them.
 
-        The distance is a global minimum. The first call prepares a search, in some milliseconds for a hundred faces.
+        The distance is a global minimum. The first call prepares a search.
 
         Parameters
         ----------
