@@ -208,7 +208,12 @@ class _Surface:
             return bsdf
         # Normals that face away from the viewer would be black. As in Cycles, only diffuse lobes have shadowing.
         shading = {"use_shadowing_function": is_diffuse, "flip_invalid_normals": True}
-        return {"type": "normalmap", "normalmap": normals, **shading, "bsdf": bsdf}
+        return {
+            "type": "normalmap",
+            "normalmap": {"type": "tangent_normals", "normals": normals},
+            **shading,
+            "bsdf": bsdf,
+        }
 
     def _opaque(self) -> SceneNode:
         if not self._is("translucency", 0):

@@ -188,15 +188,17 @@ def cropped(sensor: SceneNode, window: list[float]) -> SceneNode:
 def _sensor(camera: CameraContents, size: tuple[int, int], spp: int | None, notes: StageWarnings) -> SceneNode:
     width, height = size
     wide, high = _film_window(camera, width / height)
-    near = max(camera.near, _LEAST_NEAR)
+    # Planes of orthographic cameras may lie behind them.
+    back = 0.0 if camera.is_perspective else max(-camera.near, 0.0)
+    near, far = max(camera.near + back, _LEAST_NEAR), camera.far + back
     if camera.shutter[0] < camera.shutter[1]:
         notes.add(NO_BLUR, camera.name)
     film = {"type": "hdrfilm", "width": width, "height": height, "component_format": "float32"}
-    clip = {"near_clip": near, "far_clip": max(camera.far, 2 * near)}
+    clip = {"near_clip": near, "far_clip": max(far, 2 * near)}
     common: SceneNode = {**clip, "film": film, "sampler": sampler(spp or DEFAULT_SPP)}
     if not camera.is_perspective:
         matrix = camera.to_world.copy()
-        matrix[:3, 3] += matrix[:3, :2] @ camera.offset
+        matrix[:3, 3] += matrix[:3, :3] @ [*camera.offset, back]
         matrix = matrix @ np.diag([-wide / 2, wide / 2, -1, 1])
         return {"type": "orthographic", "to_world": mi.ScalarTransform4f(matrix.tolist()), **common}
     common["to_world"] = mi.ScalarTransform4f((camera.to_world @ _TURNED).tolist())

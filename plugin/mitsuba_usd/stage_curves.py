@@ -25,7 +25,7 @@ BASES: dict[str, NDArray[np.float64]] = {
     "catmullRom": np.array([[0.0, 2, 0, 0], [-1, 0, 1, 0], [2, -5, 4, -1], [-1, 3, -3, 1]]) / 2,
 }
 # Sine of the largest angle between tubes without a gap, and largest ratio of lengths of uniform transforms.
-_STRAIGHT, _EVEN = 1e-3, 1.001
+_STRAIGHT, EVEN = 1e-3, 1.001
 _WIRE = 1e-3  # Width of curves without widths, relative to their size
 _PLACES = (np.arange(8)[:, None] + 0.5) / 8  # Parameters along each segment at which colours are sampled
 
@@ -136,7 +136,7 @@ def read_curves(
         "normals of curves are ignored; Mitsuba's curves are tubes": value_at(curves.GetNormalsAttr(), time),
         "skeletons of curves are ignored": prim.HasAPI(UsdSkel.BindingAPI),
         "cubic curves with corners have gaps there, as Mitsuba's tubes have no caps": topology.has_corners(points),
-        "curves stay round where transforms stretch them": sizes[0] > _EVEN * sizes[2],
+        "curves stay round where transforms stretch them": sizes[0] > EVEN * sizes[2],
     }
     for what in (what for what, is_so in problems.items() if is_so):
         notes.add(what, prim.GetPath())

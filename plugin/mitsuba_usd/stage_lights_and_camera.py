@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pxr import Usd, UsdGeom, UsdLux
 
 from .contents import CameraContents, LightContents
+from .stage_curves import EVEN
 from .stage_settings import namespaced
 from .stage_warnings import StageWarnings
 
@@ -30,6 +31,9 @@ _NEUTRAL_OF_LIGHTS = {
     "inputs:shaping:focus": (0, _EVERYWHERE),
     "inputs:shaping:ies:file": (None, "Mitsuba has no lights with IES profiles"),
     "inputs:shadow:enable": (True, "all shapes cast shadows"),
+    "inputs:shadow:color": ((0, 0, 0), "shadows are where light is missing"),
+    "inputs:shadow:distance": (-1, "shadows have no end"),
+    "inputs:shadow:falloff": (-1, "shadows have no end"),
 }
 _NEUTRAL_EXPOSURE = {"exposure": 0.0, "exposure:iso": 100.0}
 _NEUTRAL_EXPOSURE |= dict.fromkeys(("exposure:time", "exposure:fStop", "exposure:responsivity"), 1.0)
@@ -44,7 +48,9 @@ def read_light(
     if given not in _KINDS:
         notes.add(f"lights of type {given} are ignored; expected one of {', '.join(_KINDS)}", path)
         return None
-    _note_ignored(prim, time, notes)
+    note_ignored(prim, time, notes)
+    if own := [attribute.GetName() for attribute in prim.GetAuthoredPropertiesInNamespace("mitsuba")]:
+        notes.add("attributes of Mitsuba are ignored at lights", f"{', '.join(own)} of {path}")
     kind, *sizes = _KINDS[given]
     size = [float(value_at(prim.GetAttribute(name), time)) for name in sizes]
     if kind == "distant" and size[0] > _POINTLIKE:
@@ -69,6 +75,8 @@ def read_light(
     numbers, is_area = [*emission, *size, *to_world.ravel()], kind not in ("distant", "dome", "point", "spot")
     if not np.isfinite(numbers).all() or np.linalg.det(to_world[:3, :3]) == 0 or (is_area and min(size) <= 0):
         raise ValueError("the light is not usable; expected finite numbers, a size above 0 and an invertible transform")
+    if kind in ("sphere", "cylinder") and np.linalg.cond(to_world[:3, kind == "cylinder" : 3]) > EVEN:
+        notes.add("sphere and cylinder lights stay round where transforms stretch them", path)
     texture = _texture(prim, time, notes) if kind in ("rect", "dome") else None
     return LightContents(str(path), kind, to_world, emission, is_normalized, size, texture, str(pole).lower())
 
@@ -87,9 +95,8 @@ def _value(prim: Usd.Prim, name: str, time: Usd.TimeCode, usual: Any) -> Any:
     return usual if value is None else value
 
 
-def _note_ignored(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> None:
-    if own := [attribute.GetName() for attribute in prim.GetAuthoredPropertiesInNamespace("mitsuba")]:
-        notes.add("attributes of Mitsuba are ignored at lights", f"{', '.join(own)} of {prim.GetPath()}")
+def note_ignored(prim: Usd.Prim, time: Usd.TimeCode, notes: StageWarnings) -> None:
+    """Warn of attributes and relationships of a light, or of a mesh that is one, which have no effect."""
     for name, (neutral, reason) in _NEUTRAL_OF_LIGHTS.items():
         value = _value(prim, name, time, neutral)
         is_cone_kept = name == _CONE and (value >= neutral or prim.GetTypeName() == "SphereLight")

@@ -18,7 +18,7 @@ from pxr import Usd, UsdGeom, UsdLux, UsdShade
 from .contents import Input, MaterialContents, ShapeContents
 from .materialx_nodes import constant
 from .stage_curves import read_curves
-from .stage_lights_and_camera import read_emission
+from .stage_lights_and_camera import note_ignored, read_emission
 from .stage_materials import MaterialReader
 from .stage_warnings import StageWarnings
 
@@ -142,9 +142,14 @@ class ShapeReader:
         names = COLORS if material is None else material.primvars()
         constants = {name: self._constant(prim, name) for name in names if name not in cage.attributes}
         constants = {name: values for name, values in constants.items() if values}
+        is_double_sided = value_at(UsdGeom.Gprim(prim).GetDoubleSidedAttr(), self._time)
+        if is_double_sided and material is not None and material.is_emissive and _is_open(cage):
+            what = "double-sided meshes with a border shine on their front only, as Mitsuba's area lights do"
+            self._notes.add(what, prim.GetPath())
         radiance, whole_light = None, None
         if prim.HasAPI(UsdLux.MeshLightAPI):
             whole_light = (whole or cage) if value_at(UsdLux.LightAPI(prim).GetNormalizeAttr(), self._time) else None
+            note_ignored(prim, self._time, self._notes)
             radiance = read_emission(prim, self._time).tolist()
             if not np.isfinite(radiance).all():
                 self._notes.add("mesh lights with numbers that are not finite are ignored", prim.GetPath())
@@ -153,32 +158,47 @@ class ShapeReader:
 
     def _with_texcoords(self, prim: Usd.Prim, cage: CageContents, name: str, fallback: Input | None) -> CageContents:
         """A cage with the named texture coordinates, or else with others of its own or the fallback."""
+        if place := self._constant(prim, name, (2,)):
+            return replace(cage, texcoords=Attribute(np.tile(place, (len(cage.positions), 1)), "vertex"))
         is_missing = not UsdGeom.PrimvarsAPI(prim).HasPrimvar(name)
         consequence = "the first others of the mesh are used"
         if cage.texcoords is None or (is_missing and fallback is not None):
-            place = np.zeros(2) if fallback is None else constant(fallback, 2)
-            consequence = f"textures are read at ({place[0]:g}, {place[1]:g})"
-            cage = replace(cage, texcoords=Attribute(np.tile(place, (len(cage.positions), 1)), "vertex"))
+            uv = np.zeros(2) if fallback is None else constant(fallback, 2)
+            consequence = f"textures are read at ({uv[0]:g}, {uv[1]:g})"
+            cage = replace(cage, texcoords=Attribute(np.tile(uv, (len(cage.positions), 1)), "vertex"))
         if is_missing:
             self._notes.add(f'texture coordinates "{name}" are missing; {consequence}', prim.GetPath())
         return cage
 
-    def _constant(self, prim: Usd.Prim, name: str) -> list[float]:
-        """Value of a constant primvar of a prim or its ancestors, of one, three or four numbers; else nothing."""
+    def _constant(self, prim: Usd.Prim, name: str, sizes: tuple[int, ...] = (1, 3, 4)) -> list[float]:
+        """Value of a constant primvar of a prim or its ancestors, of some numbers; else nothing."""
         primvar = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(name)
-        if not primvar or not primvar.HasValue() or primvar.GetInterpolation() != UsdGeom.Tokens.constant:
+        if not primvar or not primvar.HasValue():
+            return []
+        # Others of meshes and curves are read with these; solids have no vertices of their own.
+        if primvar.GetInterpolation() != UsdGeom.Tokens.constant and prim.IsA(UsdGeom.PointBased):
             return []
         values = np.asarray(value_at(primvar.GetAttr(), self._time))
         if primvar.IsIndexed() and values.ndim:
             indices = np.asarray(value_at(primvar.GetIndicesAttr(), self._time))
             values = values[indices] if ((indices >= 0) & (indices < len(values))).all() else np.zeros(0)
-        if values.dtype.kind == "f" and values.size in (1, 3, 4) and np.isfinite(values).all():
+        if values.dtype.kind == "f" and values.size in sizes and np.isfinite(values).all():
             if values.size == 4:
                 self._notes.add(_ALPHA, primvar.GetAttr().GetPath())
             return values.astype(np.float64).ravel()[:3].tolist()
-        what = "constant primvars are ignored unless they have one value of one, three or four finite numbers"
+        what = "constant primvars, and those of solids, are ignored unless they have one value of finite numbers: one, "
+        what += "three or four, or two for texture coordinates"
         self._notes.add(what, primvar.GetAttr().GetPath())
         return []
+
+
+def _is_open(cage: CageContents) -> bool:
+    """Whether an edge belongs to one face only."""
+    ends, vertices = np.cumsum(cage.face_sizes), cage.face_vertices
+    following = np.arange(1, len(vertices) + 1)
+    following[ends - 1] = ends - cage.face_sizes
+    edges = np.sort([vertices, vertices[following]], axis=0)
+    return bool((np.unique(edges, axis=1, return_counts=True)[1] == 1).any())
 
 
 def _faces_of(reader: MeshReader, indices: Usd.Attribute, face_count: int, name: str) -> IntArray:

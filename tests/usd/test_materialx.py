@@ -192,7 +192,7 @@ def test_tiles_and_bumps(stage, tmp_path):
     assert np.array(bsdf["bsdf"]["base_color"]["bitmap"]).shape == (4, 8, 3)
     # One texel is 1 / 16, and 16 levels of 255.
     slope = 16 * 16 / 255
-    normal = np.array(bsdf["normalmap"]["bitmap"])[8, 8] * 2 - 1
+    normal = np.array(bsdf["normalmap"]["normals"]["bitmap"])[8, 8] * 2 - 1
     expected = np.array([-slope, 0, 1]) / np.hypot(slope, 1)
     np.testing.assert_allclose(normal / np.linalg.norm(normal), expected, atol=2e-3)
     # In a network inside a stage, beside the layer that names them, wherever the working folder is.

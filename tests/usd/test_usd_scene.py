@@ -577,14 +577,25 @@ def test_textures_use_the_named_coordinates(shown):
     picture, (message,) = told(shown, nodes, side=4)
     assert message.endswith('"none" are missing; textures are read at (0.2, 0.8) (/square)')
     np.testing.assert_allclose(picture, np.broadcast_to([1, 0, 0], picture.shape), atol=1e-6)
-    picture = shown(texture("quadrants.png", where="inputs:st = (0.75, 0.75)"), side=4)
-    np.testing.assert_allclose(picture, np.broadcast_to([0, 1, 0], picture.shape), atol=1e-6)
+    fixed = 'texCoord2f[] primvars:other = [(0.75, 0.75)] (interpolation = "constant")'
+    upper_right = (
+        (texture("quadrants.png", name="other"), fixed),
+        (texture("quadrants.png", where="inputs:st = (0.75, 0.75)"),),
+    )
+    for nodes in upper_right:
+        picture, messages = told(shown, *nodes, side=4)
+        assert not messages
+        np.testing.assert_allclose(picture, np.broadcast_to([0, 1, 0], picture.shape), atol=1e-6)
 
 
 def picture_of_normals(path, normal):
     texels = np.broadcast_to(np.round((np.array(normal) + 1) / 2 * 255), (2, 2, 3))
     mi.Bitmap(texels.astype(np.uint8)).write(str(path))
     return "normal3f inputs:normal.connect = </paint/texture.outputs:rgb>\n", texture(path.name, "raw", FROM_BYTES)
+
+
+# Relative error of brightness by normals of eight bits, and by what Mitsuba takes away where light grazes the surface.
+MAPPED = 0.02
 
 
 def test_normal_maps_turn_the_normal(scene, tmp_path):
@@ -598,6 +609,24 @@ def test_normal_maps_turn_the_normal(scene, tmp_path):
 
     # Cosines of 0 and 74 degrees, and a little that the principled BSDF adds where light grazes.
     assert 2.5 < brightness(36.87) / brightness(-36.87) < 1 / 0.28
+
+
+@pytest.mark.parametrize("square", [SQUARE, SMOOTH_SQUARE], ids=["polygons", "limit surface"])
+def test_normal_maps_follow_mirrored_coordinates_and_transforms(scene, tmp_path, square):
+    """Normals are relative to the derivatives of the point by u and v."""
+    normal, nodes = picture_of_normals(tmp_path / "n.png", [0.48, 0.36, 0.8])
+    paint = material(f"{normal}color3f inputs:diffuseColor = (1, 1, 1)\nint inputs:useSpecularWorkflow = 1", nodes)
+    turn, across = np.radians([30, 20])
+    to_sun = np.array([np.sin(across), -np.sin(turn) * np.cos(across), np.cos(turn) * np.cos(across)])
+    sun = prim(
+        "DistantLight", "sun", "float inputs:angle = 0", "float inputs:intensity = 1", moved(rotateX=30, rotateY=20)
+    )
+    for u, v, x in product((1, -1), repeat=3):
+        coordinates = [((1 + u * i) / 2, (1 + v * j) / 2) for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        body = square.replace("[(0,0), (1,0), (1,1), (0,1)]", str(coordinates)), moved(scale=(x, 1, 1)), bound()
+        picture = rendered(scene(CAMERA + sun + paint + mesh("square", *body), size=(8, 8)), spp=4)
+        expected = to_sun @ [0.48 * u * x, 0.36 * v, 0.8] / np.pi
+        assert picture[2:6, 2:6].mean() == pytest.approx(expected, rel=MAPPED)
 
 
 # Radiance of a plane in a white environment of radiance 1, by Cycles of Blender 5.0.1: a Diffuse BSDF of 0.8, and a
@@ -772,7 +801,9 @@ def test_points_are_projected_as_by_the_camera_of_usd(stage, projection, sign):
     lens |= {"horizontalAperture": 30, "horizontalApertureOffset": 3.75 * sign}
     lens |= {"verticalAperture": 20, "verticalApertureOffset": -3 * sign}
     kind = f'token projection = "{projection.replace("thin lens", "perspective")}"'
-    view = kind, "float2 clippingRange = (0.1, 1000)", moved(rotateXYZ=(30, 20, 10), translate=(1, 2, 6))
+    # Orthographic cameras also show what is behind their origin.
+    near = -3 if projection == "orthographic" else 0.1
+    view = kind, f"float2 clippingRange = ({near}, 1000)", moved(rotateXYZ=(30, 20, 10), translate=(1, 2, 6))
     numbers = [f"float {name} = {value}" for name, value in lens.items()]
     dolly = prim("Xform", "dolly", moved(scale=(2, 2, 2)), prim("Camera", "camera", *view, *numbers))
     path = stage(dolly + mesh("cube", CUBE))
@@ -789,7 +820,9 @@ def test_points_are_projected_as_by_the_camera_of_usd(stage, projection, sign):
         near, far = ends[:, :3] / ends[:, 3:]
         direction = (far - near) / np.linalg.norm(far - near)
         np.testing.assert_allclose(np.array(ray.d).ravel(), direction, atol=2e-6)
-        assert np.linalg.norm(np.cross(np.array(ray.o).ravel() - near, direction)) < 2e-5
+        from_near = np.array(ray.o).ravel() - near
+        assert np.linalg.norm(np.cross(from_near, direction)) < 2e-5
+        assert projection == "thin lens" or abs(from_near @ direction) < 2e-5
 
 
 def settings(*lines):
@@ -911,6 +944,8 @@ def changed(old, new):
     return TEXTURED.replace(old, new.replace("...", old), 2 if old in ('"repeat"', "outputs:rgb") else 1)
 
 
+UNIFORM_COLORS = f'color3f[] primvars:displayColor = {[(1, 0, 0), (0, 1, 0)] * 3} (interpolation = "uniform")'
+GLOWING = material("color3f inputs:emissiveColor = (1, 1, 1)")
 SMALLER = render_product("p", "") + render_product("q", "", "uniform int2 resolution = (4, 4)")
 # Stages, what is told of them, and how that ends.
 IGNORED = [
@@ -922,6 +957,20 @@ IGNORED = [
     (frame("rel products = [</p>, </q>]") + SMALLER, "resolution of render products is ignored; the first", "(/q)"),
     (light("DiskLight", f"{CONE}40"), "shaping:cone:angle of lights is ignored; Mitsuba's area lights", "(/lamp)"),
     (light("SphereLight", "asset inputs:shaping:ies:file = @a.ies@"), "; Mitsuba has no lights with IES", "(/lamp)"),
+    (light("SphereLight", "color3f inputs:shadow:color = (1, 0, 0)"), "shadow:color of lights is ignored", "(/lamp)"),
+    (prim("Mesh", "lamp", CUBE, f"{CONE}40", apis=["MeshLightAPI"]), "shaping:cone:angle of lights is ign", "(/lamp)"),
+    (prim("SphereLight", "lamp", moved(scale=(2, 1, 1))), "lights stay round where transforms stretch", "(/lamp)"),
+    (prim("CylinderLight", "lamp", moved(scale=(3, 2, 1))), "lights stay round where transforms stretch", "(/lamp)"),
+    (
+        prim("Cube", "box", UNIFORM_COLORS),
+        "constant primvars, and those of solids, are ign",
+        "(/box.primvars:displayColor)",
+    ),
+    (
+        GLOWING + mesh("lamp", SQUARE, "uniform bool doubleSided = 1", bound()),
+        "with a border shine on their fr",
+        "(/lamp)",
+    ),
     (light("SphereLight", "float mitsuba:gain = 2"), "attributes of Mitsuba are ignored at", "(mitsuba:gain of /lamp)"),
     *((light("SphereLight", f"{CONE}{c}", radius=r), "without power", "(/lamp)") for c, r in ((0, 1), (90, 0))),
     *((changed(old, new), message, ")") for old, new, message in IGNORED_INPUTS),

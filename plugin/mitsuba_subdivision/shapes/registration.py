@@ -60,11 +60,13 @@ def register_variant(variant: ModuleType | str) -> type:
             if variant_to_register not in _registered:
                 from .foreground import FOREGROUND, make_foreground
                 from .subdivision_shape import make_subdivision
+                from .tangent_normals import make_tangent_normals
 
                 module = getattr(mi, variant_to_register)
                 shape = make_subdivision(module)
                 module.register_shape(PLUGIN_NAME, shape)
                 module.register_integrator(FOREGROUND, make_foreground(module))
+                module.register_texture("tangent_normals", make_tangent_normals(module))
                 _registered[variant_to_register] = shape
         return _registered[name]
 
