@@ -128,6 +128,30 @@ def test_gradients_of_views_add_up(names, displacement, shading):
         np.testing.assert_allclose(gradient, expected, rtol=0, atol=10 * ROUNDING * largest, err_msg=key)
 
 
+@exact
+@pytest.mark.parametrize("shading", ["vertex", "exact"])
+def test_gradients_of_hits_by_displacing_values_add_up(shading):
+    scene = views_of("direct", with_attributes(cube()), displacement="vertex_weight", shading=shading)
+    weights, gradients = differentiated(mi.traverse(scene), "shape.cage_weight"), []
+    for _ in range(4):
+        dr.backward(dr.sum(scene.ray_intersect(mi.Ray3f([0, -5, 0.1], [0, 1, 0])).p))
+        gradients.append(np.array(dr.grad(weights)))
+    np.testing.assert_allclose(gradients, np.outer([1, 2, 3, 4], gradients[0]), rtol=ROUNDING)
+
+
+def test_parameters_that_move_by_turns_lose_no_gradients():
+    scene = views_of("direct", with_attributes(cube()), displacement="vertex_weight")
+    parameters, size = mi.traverse(scene), dr.opaque(mi.Float, 1)
+    dr.enable_grad(size)
+    for key in ("shape.cage_weight", KEY) * 2:
+        start = mi.Float(parameters[key])
+        update(parameters, {key: start * size})
+        dr.backward(loss_at(scene, parameters, 0))
+        assert dr.grad(size)[0] != 0
+        dr.set_grad(size, 0)
+        update(parameters, {key: start})
+
+
 def test_assigned_vertices_stay_when_gradients_pass():
     scene, key = views_of("prb"), "shape.vertex_positions"
     parameters = mi.traverse(scene)
@@ -200,12 +224,13 @@ def test_losses_of_views_add_up():
     ("given", "seen", "shading"),
     [
         ("control_points", "vertex_normals", "vertex"),
+        pytest.param("control_points", "shading_coefficients", "exact", marks=exact),
         ("cage_colour", "vertex_colour", "vertex"),
         pytest.param("cage_colour", "vertex_colour", "exact", marks=exact),
     ],
 )
 def test_derivatives_do_not_keep_shapes_alive(given, seen, shading):
-    shape = load(COLOURED, shading=shading)
+    variables, shape = dr.whos_ad(as_string=True).count("\n"), load(COLOURED, shading=shading)
     parameters = mi.traverse(shape)
     differentiated(parameters, given)
     dr.backward(dr.sum(parameters[seen]))
@@ -213,24 +238,33 @@ def test_derivatives_do_not_keep_shapes_alive(given, seen, shading):
     del shape, parameters
     gc.collect()
     assert alive() is None
+    assert dr.whos_ad(as_string=True).count("\n") <= variables
 
 
-def test_edges_between_copies_of_vertices_are_no_outlines():
-    shape = load(SEAMED)
-    parameters, faces = mi.traverse(shape), buffer(shape, "faces").ravel()
-    edges = np.arange(len(faces))
-    following = edges + np.where(edges % 3 == 2, -2, 1)
-    for mirror in (1, 1, -1):
-        parameters["to_world"] = mi.ScalarTransform4f().scale([mirror, 1, 1])
-        differentiated(parameters, "control_points")
+@pytest.mark.parametrize(
+    ("key", "with_it", "adaptive"),
+    [
+        ("control_points", [{"to_world": [mirror, 1, 1]} for mirror in (1, 1, -1)], {}),
+        ("control_points", [{"max_edge": 0.4}], {"tessellation": "adaptive", "max_edge": 0.5}),
+        ("vertex_positions", [{}], {}),
+    ],
+)
+def test_edges_between_copies_of_vertices_are_no_outlines(key, with_it, adaptive):
+    shape = load(SEAMED, **adaptive)
+    parameters = mi.traverse(shape)
+    for others in with_it:
+        for name, value in others.items():
+            parameters[name] = mi.ScalarTransform4f().scale(value) if name == "to_world" else value
+        differentiated(parameters, key)
+        faces, positions = buffer(shape, "faces").ravel(), buffer(shape, "vertex_positions")
+        edges = np.arange(len(faces))
+        following = edges + np.where(edges % 3 == 2, -2, 1)
         opposite = np.array(shape.opposite_dedge(dr.arange(mi.UInt32, len(faces))))
         assert opposite.max() < len(faces)
         np.testing.assert_array_equal(opposite[opposite], edges)
         # Both have the same ends.
-        now, positions = buffer(shape, "faces").ravel(), buffer(shape, "vertex_positions")
-        np.testing.assert_array_equal(positions[now], positions[now[following[opposite]]])
-        np.testing.assert_array_equal(np.sort(now.reshape(-1, 3)), np.sort(faces.reshape(-1, 3)))
-    assert shape.vertex_count() > len(np.unique(positions, axis=0))
+        np.testing.assert_array_equal(positions[faces], positions[faces[following[opposite]]])
+        assert shape.vertex_count() == len(np.unique(faces)) > len(np.unique(positions, axis=0))
 
 
 # Gradients of outlines are in tests/gradients/test_outlines.py.

@@ -53,14 +53,15 @@ class BackwardPasses:
         def backward(*gradients: Any) -> tuple:
             call = method()
             if call is not None:
-                call(*arguments, dict(zip(arrays, gradients, strict=True)))
+                call(*arguments, dict(zip(names, gradients, strict=True)))
             return (*gradients, 0)
 
-        given = tuple(arrays.values())
+        # Copies, as arrays that are assigned in place would keep their own derivatives alive, and so for ever.
+        names, given = tuple(arrays), tuple(type(array)(array) for array in arrays.values())
         detached, probe = tuple(map(dr.detach, given)), self._float(0) if self._probe is None else self._probe
         through = attached(detached, (*given, probe), lambda changes: changes[: len(given)], backward)
         self._probe = None
-        return dict(zip(arrays, through, strict=True))
+        return dict(zip(names, through, strict=True))
 
     def warn_of_lost(
         self,

@@ -122,7 +122,7 @@ class MeshBuffers:
         heights = [] if self._displacement is None else self._displacement.variables()
         sources = [control_points, self._placement.matrix, *heights]
         moves = self.are_differentiable and dr.grad_enabled(*sources)
-        if moves:
+        if self.are_differentiable and loaded is None:
             self.passes.begin(sources)
         # Free the memory of the last evaluation before the next one.
         self._evaluated = None

@@ -197,6 +197,7 @@ def make_subdivision(
             self._mesh.retessellate(triangles)
             self._texture_scene = None
             self._assemble(moves_points=True)
+            self._weld_outlines(*self._get_buffers("vertex_positions").values())
 
         def traverse(self, callback: mi.TraversalCallback) -> None:
             super().traverse(callback)
@@ -224,6 +225,8 @@ def make_subdivision(
                 buffers = self._cage.buffers(attributes)
                 self._set_buffers(buffers)
                 super().parameters_changed([*keys, *buffers])
+                if "vertex_positions" in keys:
+                    self._weld_outlines(*self._get_buffers("vertex_positions").values())
                 return
             if self._displacement is not None and "displacement_scale" in keys:
                 self._displacement.take_scale()
@@ -248,8 +251,7 @@ def make_subdivision(
                     f"{self._parameters.source}: vertices with derivatives cannot be updated in a frozen function, as "
                     "Mitsuba reads a mesh's edges back; update them before, and freeze the picture and its gradients"
                 )
-            if is_attached and self._mesh.weld_target is not None:
-                self._weld_outlines("faces" in keys)
+            if self._weld_outlines(buffers["vertex_positions"], has_new_faces="faces" in keys):
                 keys = [key for key in keys if key != "faces"]
             # With the moved buffers among the keys, Mitsuba does not replace normals by averages of triangle normals.
             super().parameters_changed([*keys, *map(mesh_name, attributes), *_MOVED])
@@ -305,6 +307,8 @@ def make_subdivision(
 
         def renew_attribute(self, name: str, gradients: dict[str, FloatBuffer]) -> None:
             """Attach the arrays computed from an attribute's control values again; see `CageAttributes`."""
+            # Kept, as Dr.Jit must not free what was computed from the attribute during the pass.
+            self._replaced = self._get_buffers(mesh_name(name))
             with dr.resume_grad():
                 self._cage.renew(name, gradients[name])
                 self._replace_gradients(self._cage.buffers([name]))
@@ -338,21 +342,24 @@ def make_subdivision(
             buffers = ((name, variant.get_property(value, cpp_type, self)) for name, value, cpp_type in members)
             return {name: type(buffer)(buffer) for name, buffer in buffers}
 
-        def _weld_outlines(self, has_new_faces: bool) -> None:
-            """Build Mitsuba's edge data structure as if coincident vertices were one vertex.
+        def _weld_outlines(self, positions: FloatBuffer, *, has_new_faces: bool = False) -> bool:
+            """Build Mitsuba's edge data structure of differentiated vertices as if coincident ones were one vertex.
 
             Coincident vertices have different normals or texture coordinates, but leave no gap in the surface.
-            Projective integrators would treat the edges between them as silhouettes.
+            Projective integrators would treat the edges between them as silhouettes. Returns whether there are any.
             """
+            if not (self._mesh.are_differentiable and dr.grad_enabled(positions)) or self._mesh.weld_target is None:
+                return False
             if has_new_faces:
                 super().parameters_changed(["faces"])
             if self._has_outlines:
-                return
+                return True
             faces = self._get_buffers("faces")["faces"]
             self._set_buffers({"faces": dr.gather(type(faces), self._mesh.weld_target, faces)})
             self.build_directed_edges()
             self._set_buffers({"faces": faces})
             self._has_outlines = True
+            return True
 
         def precompute_silhouette(self, viewpoint: mi.ScalarPoint3f) -> tuple[IndexBuffer, FloatBuffer]:
             """Half-edges of the outline seen from a point, in the triangles that are seen, and their weights."""
