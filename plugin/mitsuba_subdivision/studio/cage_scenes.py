@@ -194,12 +194,7 @@ class CageScenes(SceneSource[PosedModel]):
         return self.factor * points
 
     def scene(
-        self,
-        contents: PosedModel,
-        points: NDArray[np.float64] | None = None,
-        *,
-        follows_sensor: bool = False,
-        turns: Sequence[NDArray[np.float64]] = (),  # noqa: ARG002
+        self, contents: PosedModel, points: NDArray[np.float64] | None = None, turns: Sequence[NDArray[np.float64]] = ()
     ) -> SceneNode:
         """Entries "surface", "cage" if it is shown, and those of the studio.
 
@@ -208,11 +203,12 @@ class CageScenes(SceneSource[PosedModel]):
         look, (model, _) = self._look, contents
         if look.checker and model.cage.texcoords is None:
             raise CageError(f"{model.cage.source.name} has no texture coordinates; expected them for a checkerboard")
+        is_still = points is None
         points = self.points(contents) if points is None else points
         up, view, size = self.framing(contents)
         bounds = np.stack([points.min(axis=0), points.max(axis=0)])
         staged = studio(bounds, up=up, view=view, size=size, spp=look.spp, points=points, name=self.name)
-        is_adaptive = follows_sensor and look.rate is None and look.shading == "exact"
+        is_adaptive = is_still and bool(turns) and look.rate is None and look.shading == "exact"
         triangles = model.triangles_for(staged["sensor"], self.factor or 1.0) if is_adaptive else None
         first = {name: staged.pop(name) for name in ("integrator", "sensor")}
         return finished({"type": "scene", **first, **self._shapes(model, triangles), **staged}, look, up)
