@@ -244,8 +244,9 @@ class CageScenes(SceneSource[PosedModel]):
         factor = self.factor or 1.0
         larger = {} if factor == 1 else {"to_world": mi.ScalarTransform4f().scale(factor)}
         surface = {"type": "subdivision", **cage, **triangles, **shading, **larger}
-        surfaces = {} if look.checker else _in_materials(model, surface, in_memory)
-        surfaces = surfaces or {"surface": {**surface, "bsdf": _material(model.cage, look.checker)}}
+        surfaces = {"surface": {**surface, "bsdf": _material(model.cage, look.checker)}}
+        if not look.checker and model.materials:
+            surfaces = _in_materials(model, surface, in_memory)
         if not look.cage:
             return surfaces
         bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(WIRE_COLOUR)}}
@@ -256,8 +257,6 @@ class CageScenes(SceneSource[PosedModel]):
 def _in_materials(model: Model, surface: SceneNode, in_memory: bool) -> SceneNode:
     """Shapes for the materials of a cage, "surface", "surface_2" and so on, with the same vertices."""
     shapes: SceneNode = {}
-    if not model.materials:
-        return shapes
     tensor: Any = mi.TensorXu  # The stubs call it an object
     for name, faces in model.cage.materials.items():
         material = model.materials.get(name)
