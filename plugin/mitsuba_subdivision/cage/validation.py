@@ -286,6 +286,9 @@ def validated_tags(
     """
     edges = _table(creases, 3, "creases", "(vertex, vertex, sharpness)", source)
     vertices = _table(corners, 2, "corners", "(vertex, sharpness)", source)
+    if not len(edges) and not len(vertices):
+        # Most cages. Takes no memory.
+        return Sharpness(np.broadcast_to(0.0, topology.half_edge_count), np.broadcast_to(0.0, topology.vertex_count))
     starts, ends = edges[:, :2].astype(np.int64).T
     half_edge, vertex = _half_edges_between(topology, starts, ends), vertices[:, 0].astype(np.int64)
 
@@ -336,7 +339,7 @@ def _sharpness(
 ) -> NDArray[np.float64]:
     """A read-only array of values, clamped to `INFINITE`, at ``indices`` and at twins of these; else zero."""
     if not len(indices):
-        return np.broadcast_to(0.0, count)  # Takes no memory, in most cages
+        return np.broadcast_to(0.0, count)
     sharpness = np.zeros(count)
     sharpness[indices] = np.minimum(values, INFINITE)
     if twins is not None:
