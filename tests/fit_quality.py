@@ -31,9 +31,9 @@ import numpy as np
 from kernels.surfaces import CAGES
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.device_arrays import upload
-from mitsuba_subdivision.figures.fit import LIGHTS, integrator
+from mitsuba_subdivision.figures.fit import LIGHTS
 from mitsuba_subdivision.fit import CageFit, Schedule, View
-from mitsuba_subdivision.fit.cage_fit import with_sample_count
+from mitsuba_subdivision.fit.cage_fit import DEFAULT_INTEGRATOR, with_sample_count
 from mitsuba_subdivision.mitsuba_mesh import mitsuba_mesh
 from reference.refined_cages import tagged
 from scipy.spatial import cKDTree
@@ -58,7 +58,7 @@ CREASE_TARGET_SPP = 4096
 # Above all of them, as points jump where edges of unequal sharpness meet and one of them passes an integer: from below,
 # or from an integer itself, edges of one corner may end on either side.
 CREASE_START = 2.6
-STAGE = {"integrator": integrator(SPP, EDGE_SPP), **LIGHTS}
+STAGE = {"integrator": {**DEFAULT_INTEGRATOR, "sppc": SPP, "sppp": EDGE_SPP}, **LIGHTS}
 BSDF = {"type": "twosided", "inside": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.7}}}
 CUBE = cube()
 

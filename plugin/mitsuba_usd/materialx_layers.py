@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import importlib.util
 import posixpath
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mitsuba_subdivision.cage import warn
 from pxr import Ar, Sdf, Usd, UsdShade, UsdUtils
 
-if TYPE_CHECKING:
+with suppress(ImportError):  # `has_materialx` tells
     import MaterialX
 
 _EXTENSION = ".mtlx"
@@ -76,8 +77,6 @@ def with_documents(stage: Usd.Stage, name: str) -> Usd.Stage:
 
 def _layer_of_document(path: str, name: str) -> Sdf.Layer | None:
     """The layer of a document; None, with a warning, if it is unreadable."""
-    import MaterialX
-
     resolved = Ar.GetResolver().Resolve(path)
     if not resolved:
         return None
@@ -113,8 +112,6 @@ def _beside(path: str, document: str) -> str:
 
 
 def _add_material(stage: Usd.Stage, node: MaterialX.Node) -> None:
-    import MaterialX
-
     path = stage.GetPrimAtPath("/MaterialX/Materials").GetPath().AppendChild(_prim_name(node.getName()))
     material = UsdShade.Material.Define(stage, path)
     for kind, output in _OUTPUTS.items():
@@ -143,8 +140,6 @@ def _add_graph(material: UsdShade.Material, graph: Any, path: Sdf.Path, inputs: 
 
 def _add_node(material: UsdShade.Material, node: MaterialX.Node, parent: Sdf.Path) -> Sdf.Path:
     """Add a node, as a graph if the document defines it by one; return its path."""
-    import MaterialX
-
     stage, path = material.GetPrim().GetStage(), parent.AppendChild(_prim_name(node.getName()))
     if stage.GetPrimAtPath(path):
         return path
@@ -188,10 +183,7 @@ def _connect(material: UsdShade.Material, attribute: Usd.Attribute, port: Any, p
         if not port.getOutputString() and graph.getOutputs():
             output = graph.getOutputs()[0].getName()
     else:
-        # Outputs belong to the graph of their nodes, inputs to a node of it.
-        graph = port.getParent() if port.getCategory() == "output" else port.getParent().getParent()
-        node = graph.getNode(port.getNodeName()) if port.getNodeName() else None
-        if node is None:
+        if (node := port.getConnectedNode()) is None:
             return False
         path = _add_node(material, node, parent)
     attribute.AddConnection(path.AppendProperty(f"outputs:{_prim_name(output)}"))
@@ -233,8 +225,6 @@ def has_materialx() -> bool:
 @cache
 def library() -> MaterialX.Document:
     """Document with the definitions of the standard libraries."""
-    import MaterialX
-
     document = MaterialX.createDocument()
     folders = [f"{root}/{name}" for root in MaterialX.getDefaultDataLibraryFolders() for name in _FOLDERS]
     MaterialX.loadLibraries(folders, MaterialX.getDefaultDataSearchPath(), document)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from mitsuba_subdivision.cage import same
@@ -20,7 +21,7 @@ from .stage_warnings import StageWarnings
 from .surface_models import LEFT_OUT, MODELS, PREVIEW
 from .texture_image import UDIM, V_DOWN
 
-if TYPE_CHECKING:
+with suppress(ImportError):  # `has_materialx` tells
     import MaterialX
 
 
@@ -335,8 +336,6 @@ class MaterialReader:
         return modes[0]
 
     def _made(self, definition: MaterialX.NodeDef, output: str, inputs: _Inputs, prim: object) -> Input | None:
-        import MaterialX
-
         category = definition.getNodeString()
         kinds = {port.getName(): port.getType() for port in definition.getActiveOutputs()}
         kind = kinds.get(output, definition.getType())

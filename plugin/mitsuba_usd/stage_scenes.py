@@ -164,8 +164,6 @@ class StageScenes(studio.SceneSource[SceneContents]):
         self,
         contents: SceneContents,
         points: NDArray[np.float64] | None = None,
-        *,
-        follows_sensor: bool = False,
         turns: Sequence[NDArray[np.float64]] = (),
     ) -> SceneNode:
         """Entries of a scene, with polygon meshes for `with_meshes`. Raises CageError without a usable mesh."""
@@ -177,12 +175,12 @@ class StageScenes(studio.SceneSource[SceneContents]):
             points = np.array([[-1.0] * 3, [1.0] * 3])
         if len(points):
             rest = with_studio_defaults(contents, points, self._is_lit, self._look, self._notes, self.name)
-        if rest and (turns or follows_sensor):
+        if rest and turns:
             place, transform = rest["sensor"]["to_world"], mi.ScalarTransform4f
             moved = [{**rest["sensor"], "to_world": transform(turn.tolist()) @ place} for turn in turns]
-            needed = picture_detail.texels_for_pictures(contents, moved or [rest["sensor"]])
+            needed = picture_detail.texels_for_pictures(contents, moved)
         if rest and is_one_picture:
-            contents, chosen = self._for_picture(contents, rest["sensor"], follows_sensor)
+            contents, chosen = self._for_picture(contents, rest["sensor"], bool(turns))
         else:
             contents, parameters = self._with_copies(contents)
         textures = Textures(self._notes, needed, self._look.texture_size)

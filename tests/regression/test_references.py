@@ -61,7 +61,7 @@ def test_the_tile_tier_finds_one_per_cent_and_passes_without_a_change(reference,
 def test_a_failure_by_chance_gets_a_second_attempt(reference, valence):
     # At this level about every second image fails.
     strict = {**reference.metadata["tolerances"], "alpha": 0.9, "floor_relative": 0.0}
-    tried = compare_scene(reference, scene_of(valence), ["tile"], 64, Tolerances().with_values(strict))
+    tried = compare_scene(reference, scene_of(valence), 64, tiers=["tile"], tolerances=Tolerances().with_values(strict))
     samples = int(tried.test.estimate.count.max())
     assert (samples == 256) == any("second attempt" in note for note in tried.notes)
 

@@ -189,10 +189,8 @@ def same(a: Any, b: Any, but: frozenset[str] = frozenset()) -> bool:
     """
     if a is b or (isinstance(a, CageSource) and isinstance(b, CageSource)):
         return True
-    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
-        return np.array_equal(a, b)
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
-        return False
+        return isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and np.array_equal(a, b)
     if is_dataclass(a):
         names = [attribute.name for attribute in fields(a) if attribute.name not in but]
         return type(a) is type(b) and all(same(getattr(a, name), getattr(b, name)) for name in names)

@@ -6,23 +6,23 @@ A new command is a line of `COMMANDS` and a function that adds options to the co
 
 from __future__ import annotations
 
-import importlib
+import pkgutil
 from collections.abc import Sequence
 
 from .. import __version__
 from ..messages import PROGRAM
 from .arguments import CommandParser
 
-# ``module.function`` of this package, and a line of help. Only the module of the given command is imported.
+# ``module:function`` of this package, and a line of help. Only the module of the given command is imported.
 COMMANDS = {
-    "figure": ("figure.figure", "draw a figure of the documentation"),
-    "render": ("render.render", "render a scene, or a model in a studio"),
-    "info": ("info.info", "describe a control cage"),
-    "tessellate": ("info.tessellate", "write a limit surface as triangles"),
-    "compare": ("compare.compare", "compare two images, or a scene with its reference"),
-    "accept": ("compare.accept", "make references of the pictures of failed tests"),
-    "merge": ("compare.merge", "merge the passes of an image"),
-    "doctor": ("info.doctor", "test what works on this machine"),
+    "figure": ("figure:figure", "draw a figure of the documentation"),
+    "render": ("render:render", "render a scene, or a model in a studio"),
+    "info": ("info:info", "describe a control cage"),
+    "tessellate": ("info:tessellate", "write a limit surface as triangles"),
+    "compare": ("compare:compare", "compare two images, or a scene with its reference"),
+    "accept": ("compare:accept", "make references of the pictures of failed tests"),
+    "merge": ("compare:merge", "merge the passes of an image"),
+    "doctor": ("info:doctor", "test what works on this machine"),
 }
 
 
@@ -37,6 +37,5 @@ def parser(words: Sequence[str] = tuple(COMMANDS)) -> CommandParser:
         command = commands.add_parser(name, help=text)
         command.set_defaults(parser=command)
         if name in words:
-            module, function = place.split(".")
-            getattr(importlib.import_module(f".{module}", __name__), function)(command)
+            pkgutil.resolve_name(f"{__name__}.{place}")(command)
     return program

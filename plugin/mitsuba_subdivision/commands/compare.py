@@ -98,12 +98,13 @@ def _compare(options: argparse.Namespace) -> int:
     if options.html:
         require_folder(options.html)
         require_writable(options.html / "index.html")
+    how = {"tiers": tiers, "tolerances": tolerances, "missing": options.missing_channels}
     if test is None:
         with variant_set(renders.variant_for(reference)):
-            spp, seed, missing = options.spp or renders.TEST_SPP, options.seed or 0, options.missing_channels
-            comparison = renders.compare_scene(reference, options.test, tiers, spp, tolerances, 1, seed, missing)
+            spp, seed = options.spp or renders.TEST_SPP, options.seed or 0
+            comparison = renders.compare_scene(reference, options.test, spp, seed, **how)
     else:
-        comparison = compare_images(reference, test, tiers, tolerances, missing=options.missing_channels)
+        comparison = compare_images(reference, test, **how)
     text = json.dumps(comparison.as_dict(), indent=1)
     if options.json and options.json != "-":
         write_text(Path(options.json), f"{text}\n")

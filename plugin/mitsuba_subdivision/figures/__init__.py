@@ -6,7 +6,7 @@ written files. The line describes the figure and lists its options, for the comm
 
 from __future__ import annotations
 
-import importlib
+import pkgutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,11 +40,10 @@ class Figure:
             import matplotlib  # noqa: F401 - only to find out whether it is there
         except ImportError as error:
             raise FigureError("figures need matplotlib: pip install 'mitsuba-subdivision[figures]'") from error
-        module = importlib.import_module(f".{self.module}", __name__)
-        draw: Callable[[FigureOptions], list[Path]] = getattr(module, f"draw_{self.name}")
+        draw: Callable[[FigureOptions], list[Path]] = pkgutil.resolve_name(f"{__name__}.{self.module}:draw_{self.name}")
         if options.cage:
             # Warns about the cage once, before the figure makes others of it.
-            importlib.import_module(".staging", __name__).read(options.cage)
+            pkgutil.resolve_name(f"{__name__}.staging:read")(options.cage)
         with without_warnings():
             return draw(options)
 

@@ -207,14 +207,14 @@ def draw_tree(options: FigureOptions) -> list[Path]:
 def _in_the_plane(topology: Topology) -> FloatArray:
     """Control points of a one-ring in the plane: the border on a circle, other points amid their neighbours."""
     t = topology
-    laplacian = np.zeros((t.vertex_count, t.vertex_count))
-    start, end = t.face_vertices, t.face_vertices[t.next]
-    laplacian[start, end] = laplacian[end, start] = -1
+    laplacian = t.laplacian().toarray()
+    np.fill_diagonal(laplacian, 0)
     corners = t.face_vertices[: t.face_sizes[0]]  # Makes the face large
     laplacian[np.ix_(corners, corners)] *= SLACK
     np.fill_diagonal(laplacian, -laplacian.sum(axis=1))
     # Around the border, from any of its half-edges.
-    following = dict(zip(start[t.twin < 0].tolist(), end[t.twin < 0].tolist(), strict=True))
+    start, end = t.face_vertices[t.twin < 0], t.face_vertices[t.next[t.twin < 0]]
+    following = dict(zip(start.tolist(), end.tolist(), strict=True))
     border = [next(iter(following))]
     while (vertex := following[border[-1]]) != border[0]:
         border.append(vertex)

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from ..cage import ControlCage, cube
 from ..device_arrays import upload
 from ..fit import CageFit, LargeSteps, Schedule, View
-from ..fit.cage_fit import with_sample_count
+from ..fit.cage_fit import DEFAULT_INTEGRATOR, with_sample_count
 from ..fit.point_fit import mesh_samples
 from ..fit.smoothness import rows
 from ..messages import counted
@@ -59,6 +59,8 @@ LIGHTS = {
         "irradiance": {"type": "rgb", "value": [0.5, 0.8, 1.2]},
     },
 }
+# The integrator has gradients of outlines, too.
+SCENE = {**LIGHTS, "integrator": {**DEFAULT_INTEGRATOR, "sppc": SPP, "sppp": EDGE_SPP}}
 GLAZE = {"roughness": 0.36, "specular": 0.5, "clearcoat": 1.0, "clearcoat_gloss": 0.96}
 CLAY = {"type": "principled", "base_color": {"type": "rgb", "value": [0.74, 0.24, 0.07]}, **GLAZE}
 RODS = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.62, 0.66, 0.70]}}
@@ -127,11 +129,6 @@ def ball_cage(halvings: int, radius: float) -> ControlCage:
     return cage.with_positions(radius / np.sqrt(LimitSurface(cage).area() / (4 * np.pi)) * cage.positions)
 
 
-def integrator(spp: int, edge_spp: int) -> SceneNode:
-    """The integrator, with gradients of outlines, too."""
-    return {"type": "direct_projective", "sppi": 0, "sppc": spp, "sppp": edge_spp}
-
-
 def _views_of(shape: mi.Shape, pixels: int) -> list[View]:
     scene = mi.load_dict({"type": "scene", "integrator": {"type": "direct"}, **LIGHTS, "shape": shape})
     film = {"type": "hdrfilm", "width": pixels, "height": pixels, "rfilter": {"type": "box"}, "sample_border": True}
@@ -155,7 +152,7 @@ def _fit_cage(refine: list[int], views: list[View]) -> Course:
     fit = CageFit(
         ball_cage(COARSE, RADIUS),
         views,
-        {**LIGHTS, "integrator": integrator(SPP, EDGE_SPP)},
+        SCENE,
         shape={"bsdf": GREY},
         learning_rate=[(0, RATES[0]), (STEPS, RATES[1])],
         smoothing=SMOOTHING,
@@ -172,7 +169,7 @@ def _fit_mesh(views: list[View]) -> Course:
     ball = ball_cage(DENSE, RADIUS)
     mesh = ControlCage(ball.positions, ball.triangles)
     shape = make_mesh(mesh.positions, ball.triangles, GREY)
-    scene = mi.load_dict({"type": "scene", "integrator": integrator(SPP, EDGE_SPP), **LIGHTS, "mesh": shape})
+    scene = mi.load_dict({"type": "scene", **SCENE, "mesh": shape})
     params, key = mi.traverse(scene), "mesh.vertex_positions"
     targets = [upload(mi.TensorXf, view.picture) for view in views]
     sensors = [with_sample_count(view.sensor, SPP) for view in views]
@@ -213,7 +210,7 @@ def _fit_creases() -> tuple[list[Box], NDArray[np.float64]]:
     fit = CageFit(
         start,
         _views_of(limit_surface(target, BOX_RATE, GREY), BOX_PIXELS),
-        {**LIGHTS, "integrator": integrator(SPP, EDGE_SPP)},
+        SCENE,
         shape={"bsdf": GREY, "tessellation_rate": BOX_RATE},
         learning_rate=[(0, BOX_RATES[0]), (CREASE_STEPS, BOX_RATES[1])],
         smoothing=0,

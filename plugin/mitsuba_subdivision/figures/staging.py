@@ -155,7 +155,7 @@ def render_panels(options: FigureOptions, axes: Any, scenes: Iterable[tuple[str,
 def project(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.float64]:
     """Pixel coordinates ``(.., n, 2)`` of world points ``(.., n, 3)``."""
     parameters = mi.traverse(sensor)
-    camera = _in_camera(sensor, points)
+    camera = points_at(points, np.linalg.inv(camera_matrix(sensor)))
     # Mitsuba's cameras look along +z, with x to the left and y up. An orthographic camera covers -1 to 1 in x and y.
     half_width = np.ones_like(camera[..., 2:])
     if "x_fov" in parameters:
@@ -166,9 +166,9 @@ def project(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.float
 
 def visible(scene: mi.Scene, points: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Whether each point ``(n, 3)`` is visible to the scene's orthographic camera."""
-    sensor = scene.sensors()[0]
-    backward = -camera_matrix(sensor)[:3, 2]
-    start = points + LIFT * _in_camera(sensor, points)[:, 2:] * backward
+    to_world = camera_matrix(scene.sensors()[0])
+    backward = -to_world[:3, 2]
+    start = points + LIFT * points_at(points, np.linalg.inv(to_world))[:, 2:] * backward
     towards = mi.Vector3f(*(backward / np.linalg.norm(backward)).tolist())
     if "scalar" in str(mi.variant()):
         return np.array([not scene.ray_test(mi.Ray3f(mi.Point3f(p), towards)) for p in start], dtype=bool)
@@ -187,10 +187,6 @@ def visible_runs(scene: mi.Scene, lines: NDArray[np.floating]) -> list[NDArray[n
 def camera_matrix(sensor: mi.Sensor) -> NDArray[np.float64]:
     """Transform ``(4, 4)`` from the camera to the world."""
     return np.array(sensor.world_transform().matrix, dtype=np.float64).reshape(4, 4)
-
-
-def _in_camera(sensor: mi.Sensor, points: NDArray[np.floating]) -> NDArray[np.float64]:
-    return points_at(points, np.linalg.inv(camera_matrix(sensor)))
 
 
 def around_vertices(path: Path, most: int) -> dict[str, ControlCage]:

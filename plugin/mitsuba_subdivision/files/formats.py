@@ -6,8 +6,8 @@ A new format is a module and a line in `FORMATS`.
 from __future__ import annotations
 
 import errno
-import importlib
 import os
+import pkgutil
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
@@ -126,8 +126,7 @@ def warn_of_losses(path: str | Path, parts: Mapping[str, bool]) -> None:
 
 def function_named(name: str) -> Callable[..., Any]:
     """The function of this package that a `Format` names."""
-    module, function = name.split(":")
-    return getattr(importlib.import_module(f".{module}", __package__), function)
+    return pkgutil.resolve_name(f"{__package__}.{name}")
 
 
 def _known_suffix(

@@ -28,8 +28,7 @@ _COMMENT = re.compile(rb"#[^\n]*")
 _MATERIAL, _COMMENT_OF_NAME = re.compile(rb"[ \t]*usemtl[ \t]"), re.compile(rb"[ \t]#(?=\s|$)")
 # Other formats of files that are often named ".obj", by their first bytes.
 _NO_TEXT = {
-    b"\xff\xfe": "text in UTF-16; expected ASCII or UTF-8",
-    b"\xfe\xff": "text in UTF-16; expected ASCII or UTF-8",
+    **dict.fromkeys((b"\xff\xfe", b"\xfe\xff"), "text in UTF-16; expected ASCII or UTF-8"),
     b"\x1f\x8b": "compressed with gzip; expected the text, which gunzip makes of it",
     b"PK\x03\x04": "a zip archive; expected the text file in it",
     b"BZh": "compressed with bzip2; expected the text, which bunzip2 makes of it",

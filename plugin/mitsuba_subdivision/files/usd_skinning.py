@@ -73,16 +73,11 @@ class Skinning:
             self._report(f"{what}, as without a SkelRoot above or a skeleton", prim.GetPath())
         return None
 
-    def _skeleton(self, prim: Usd.Prim) -> UsdSkel.SkeletonQuery:
-        from pxr import UsdSkel
-
-        return self._cache.GetSkelQuery(UsdSkel.BindingAPI(prim).GetInheritedSkeleton())
-
     def _blended(self, query: UsdSkel.SkinningQuery, points: NDArray[np.float64]) -> NDArray[np.float64]:
         from pxr import UsdSkel, Vt
 
         prim, mapper = query.GetPrim(), query.GetBlendShapeMapper()
-        skeleton = self._skeleton(prim)
+        skeleton = self._cache.GetSkelQuery(UsdSkel.BindingAPI(prim).GetInheritedSkeleton())
         animation = skeleton.GetAnimQuery() if skeleton else None
         weights = animation.ComputeBlendShapeWeights(self.time) if animation else None
         if not weights or mapper is None:
@@ -97,10 +92,10 @@ class Skinning:
         return np.array(moved, dtype=np.float64)
 
     def _skinned(self, query: UsdSkel.SkinningQuery, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        from pxr import Vt
+        from pxr import UsdSkel, Vt
 
         prim = query.GetPrim()
-        skeleton = self._skeleton(prim)
+        skeleton = self._cache.GetSkelQuery(UsdSkel.BindingAPI(prim).GetInheritedSkeleton())
         joints = skeleton.ComputeSkinningTransforms(self.time) if skeleton else None
         placed = np.array(self._transforms.GetLocalToWorldTransform(prim))
         moved = Vt.Vec3fArray.FromNumpy(points.astype(np.float32))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..cage.contents import RULES, Attribute, CageContents
 from ..whole_file import whole_file
 from .formats import Triangles, warn_of_losses
-from .usd_stage import INTERPOLATIONS, RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, is_possible, require_usd, token
+from .usd_stage import RULE_ATTRIBUTES, SCHEMES, TEXCOORDS, is_possible, require_usd, token
 
 if TYPE_CHECKING:
     from pxr import UsdGeom
@@ -53,11 +53,9 @@ def write_usd_triangles(path: str | Path, surface: Triangles) -> None:
     """Write triangles to a USD file in single precision, as a mesh without subdivision."""
     positions, normals, triangles, texcoords, attributes = surface
     with _new_mesh(path, "surface", positions, np.full(len(triangles), 3), triangles) as mesh:
-        from pxr import UsdGeom
-
-        mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+        mesh.CreateSubdivisionSchemeAttr("none")
         mesh.CreateNormalsAttr(_floats(normals))
-        mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+        mesh.SetNormalsInterpolation("vertex")
         possible = {name: Attribute(values) for name, values in attributes.items() if is_possible(name)}
         warn_of_losses(path, {f'attribute "{name}"': name not in possible for name in attributes})
         _set_primvars(mesh, None if texcoords is None else Attribute(texcoords), possible)
@@ -92,7 +90,6 @@ def _set_primvars(mesh: UsdGeom.Mesh, texcoords: Attribute | None, attributes: d
 
     types = Sdf.ValueTypeNames
     by_width = {1: types.FloatArray, 2: types.Float2Array, 3: types.Float3Array, 4: types.Float4Array}
-    usd_interpolation = {ours: name for name, ours in INTERPOLATIONS.items()}
     api = UsdGeom.PrimvarsAPI(mesh)
     for name, attribute in {**attributes, **({TEXCOORDS[0]: texcoords} if texcoords else {})}.items():
         width = attribute.values.shape[1]
@@ -101,7 +98,7 @@ def _set_primvars(mesh: UsdGeom.Mesh, texcoords: Attribute | None, attributes: d
             kind = types.TexCoord2fArray
         elif name == "displayColor" and width == 3:
             kind = types.Color3fArray
-        primvar = api.CreatePrimvar(name, kind, usd_interpolation[attribute.interpolation])
+        primvar = api.CreatePrimvar(name, kind, token(attribute.interpolation))
         primvar.Set(_floats(attribute.values))
         if width not in by_width:
             primvar.SetElementSize(width)

@@ -10,10 +10,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from ..cage.contents import RULES, TEXCOORDS, Attribute, CageContents, attributes_by_name
 from ..cage.control_cage import ControlCage, cage_of
@@ -24,9 +25,6 @@ from ..mesh.cuts import Sharpness, value_mesh
 from ..mesh.manifold import is_later
 from ..schemes import Refinement, Scheme, SchemeError
 from .adapted_scheme import adapted_scheme, subdivided_values
-
-if TYPE_CHECKING:
-    from scipy import sparse
 
 # Tolerance when comparing sharpness. Chaikin's method averages a few numbers below ten, whose order may differ.
 MEAN_TOLERANCE = 1e-13
@@ -110,8 +108,6 @@ def _primal(cage: ControlCage, scheme: Scheme, contents: CageContents) -> CageRe
 
 def _over_control_points(cage: ControlCage, refinement: Refinement, rows: IntArray) -> sparse.csr_array:
     """Return stencils over the cage's control points of refined vertices of the cut mesh, selected by ``rows``."""
-    from scipy import sparse
-
     weights = refinement.stencils.matrix[rows]
     columns, shape = cage.cut_mesh.vertex[weights.indices], (len(rows), cage.vertex_count)
     matrix = sparse.csr_array((weights.data, columns, weights.indptr), shape=shape)

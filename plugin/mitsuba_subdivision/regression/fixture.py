@@ -116,8 +116,9 @@ class RenderRegression:
             # All scenes with a reference share the probability of a false alarm, in any selection of tests.
             suite_size = max(1, len(list(self.references.rglob("*.exr"))))
             count = max(1, round(spp * self.spp_scale))
+            options = {"tiers": tiers, "tolerances": limits, "suite_size": suite_size, "missing": missing_channels}
             with variant_set(chosen_variant(variant) if variant else renders.variant_for(reference)):
-                return renders.compare_scene(reference, scene, tiers, count, limits, suite_size, seed, missing_channels)
+                return renders.compare_scene(reference, scene, count, seed, **options)
 
         failure = ""
         try:

@@ -33,7 +33,6 @@ _PROBE |= {"shape": ("shape",), "triangle": ("prim",), "element": ("element",)}
 # Channels whose empty pixels, in the display window outside the data window, are not 0.
 _EMPTY = {"N": 1, **{f"{prefix}{name}": NOTHING for prefix in ("", _OF_PROBE) for name in ("shape", "prim", "element")}}
 _GIT_LFS = b"version https://git-lfs"
-_MAGIC = b"\x76\x2f\x31\x01"
 _quieting = threading.Lock()
 
 
@@ -340,7 +339,7 @@ def read_channels(path: str | Path) -> tuple[Channels, dict[str, Any], tuple[int
     if not parts:
         with path.open("rb") as start:
             begin = start.read(len(_GIT_LFS))
-        is_exr = begin.startswith(_MAGIC)
+        is_exr = OpenEXR.isOpenExrFile(str(path))
         if begin == _GIT_LFS:
             raise ContentElsewhere(f'image "{path}" is a pointer of git-lfs without pixels; get them by: git lfs pull')
         raise RegressionError(f'image "{path}" {"is truncated, or damaged" if is_exr else "is not an OpenEXR file"}')

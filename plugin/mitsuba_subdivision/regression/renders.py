@@ -292,16 +292,9 @@ def _load_like(reference: Image, source: GivenScene) -> LoadedScene:
 
 
 def compare_scene(
-    reference: Image,
-    source: GivenScene,
-    tiers: Sequence[str] | None = None,
-    spp: int = TEST_SPP,
-    tolerances: Tolerances | None = None,
-    suite_size: int = 1,
-    seed: int = 0,
-    missing: str = "warn",  # As in `compare`
+    reference: Image, source: GivenScene, spp: int = TEST_SPP, seed: int = 0, **options: Any
 ) -> Comparison:
-    """Render a scene as its reference was, in the current variant, and `compare` the two.
+    """Render a scene as its reference was, in the current variant, and `compare` the two with further options of that.
 
     If only the tile tier fails, a second attempt with four times as many new samples decides. If the paired tier warns,
     as on another machine, and still no tier fails, the tile tier decides with all samples of the reference, so that
@@ -312,7 +305,7 @@ def compare_scene(
     def compared(pixels: Image) -> Comparison:
         metadata = {**test.metadata, "sampling": pixels.metadata["sampling"]}
         image = replace(test, pixels=pixels.pixels, estimate=pixels.estimate, metadata=metadata)
-        return compare(reference, image, tiers, tolerances, suite_size, missing)
+        return compare(reference, image, **options)
 
     comparison = compared(test)
     failed = [tier for tier in comparison.tiers if tier.status is Status.FAIL]

@@ -121,7 +121,7 @@ def _parsed_scene(
             resolver.prepend(str(source.resolve().parent))
             state = mi.parser.parse_file(config, str(source), **parameters)
         try:
-            files = _checksums(source, state) if isinstance(source, Path) else {}
+            files = _checksums(source, state, resolver) if isinstance(source, Path) else {}
             if filter_name:
                 _replace_filter(state, filter_name)
             # If meshes are merged, addresses in memory decide the order of area lights, and so the random numbers.
@@ -136,21 +136,16 @@ def _parsed_scene(
     return (made[0] if isinstance(made, (list, tuple)) and len(made) == 1 else made), files
 
 
-def _file_resolver() -> Any:
-    return mi.file_resolver()  # type: ignore[operator] # the stubs call this function an object
-
-
 @contextmanager
 def kept_search_folders() -> Iterator[Any]:
     """Yield Mitsuba's file resolver, and restore its folders afterwards."""
-    resolver = _file_resolver()
-    before = [str(folder) for folder in resolver]
+    mitsuba: Any = mi  # The stubs call functions of resolvers objects
+    before = mitsuba.file_resolver()
+    mitsuba.set_file_resolver(mi.FileResolver(before))
     try:
-        yield resolver
+        yield mitsuba.file_resolver()
     finally:
-        resolver.clear()
-        for folder in before:
-            resolver.append(folder)
+        mitsuba.set_file_resolver(before)
 
 
 def _replace_filter(state: mi.parser.ParserState, name: str) -> None:
@@ -168,13 +163,13 @@ def _replace_filter(state: mi.parser.ParserState, name: str) -> None:
         properties["reconstruction_filter"] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
 
 
-def _checksums(path: Path, state: mi.parser.ParserState) -> dict[str, str]:
+def _checksums(path: Path, state: mi.parser.ParserState, resolver: Any) -> dict[str, str]:
     folder = path.resolve().parent
     files = {Path(str(name)).resolve() for name in state.files if str(name)}
     for node in state.nodes:
         for key, value in node.props.items():
             if node.props.type(key) == mi.Properties.Type.String:
-                named = Path(str(_file_resolver().resolve(value)))
+                named = Path(str(resolver.resolve(value)))
                 # `Path.is_file` raises an error for a text that is longer than any name.
                 if value and os.path.isfile(named):
                     files.add(named.resolve())

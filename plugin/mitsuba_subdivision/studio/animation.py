@@ -80,9 +80,8 @@ class SceneSource(ABC, Generic[Contents]):
         self,
         contents: Contents,
         points: NDArray[np.float64] | None = None,  # (n, 3): of all frames; by default, of the contents
-        *,
-        follows_sensor: bool = False,  # Whether triangles may depend on the sensor, the only one of the scene
-        turns: Sequence[NDArray[np.float64]] = (),  # (4, 4) each: motion of that sensor
+        # (4, 4) each: motion of the only sensor, on which triangles and textures may depend; empty if they may not
+        turns: Sequence[NDArray[np.float64]] = (),
     ) -> SceneNode:
         """Entries of a scene."""
 
@@ -108,7 +107,7 @@ class StillPicture:
     """
 
     def __init__(self, source: SceneSource[Any], *, follows_sensor: bool = True) -> None:
-        self._scene = source.scene(source.at(), follows_sensor=follows_sensor)
+        self._scene = source.scene(source.at(), turns=[np.eye(4)] if follows_sensor else [])
 
     @property
     def scene(self) -> SceneNode:

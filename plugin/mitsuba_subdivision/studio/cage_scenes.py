@@ -194,12 +194,7 @@ class CageScenes(SceneSource[PosedModel]):
         return self.factor * points
 
     def scene(
-        self,
-        contents: PosedModel,
-        points: NDArray[np.float64] | None = None,
-        *,
-        follows_sensor: bool = False,
-        turns: Sequence[NDArray[np.float64]] = (),  # noqa: ARG002
+        self, contents: PosedModel, points: NDArray[np.float64] | None = None, turns: Sequence[NDArray[np.float64]] = ()
     ) -> SceneNode:
         """Entries "surface", "cage" if it is shown, and those of the studio.
 
@@ -208,11 +203,12 @@ class CageScenes(SceneSource[PosedModel]):
         look, (model, _) = self._look, contents
         if look.checker and model.cage.texcoords is None:
             raise CageError(f"{model.cage.source.name} has no texture coordinates; expected them for a checkerboard")
+        is_still = points is None
         points = self.points(contents) if points is None else points
         up, view, size = self.framing(contents)
         bounds = np.stack([points.min(axis=0), points.max(axis=0)])
         staged = studio(bounds, up=up, view=view, size=size, spp=look.spp, points=points, name=self.name)
-        is_adaptive = follows_sensor and look.rate is None and look.shading == "exact"
+        is_adaptive = is_still and bool(turns) and look.rate is None and look.shading == "exact"
         triangles = model.triangles_for(staged["sensor"], self.factor or 1.0) if is_adaptive else None
         first = {name: staged.pop(name) for name in ("integrator", "sensor")}
         return finished({"type": "scene", **first, **self._shapes(model, triangles), **staged}, look, up)
@@ -248,8 +244,9 @@ class CageScenes(SceneSource[PosedModel]):
         factor = self.factor or 1.0
         larger = {} if factor == 1 else {"to_world": mi.ScalarTransform4f().scale(factor)}
         surface = {"type": "subdivision", **cage, **triangles, **shading, **larger}
-        surfaces = {} if look.checker else _in_materials(model, surface, in_memory)
-        surfaces = surfaces or {"surface": {**surface, "bsdf": _material(model.cage, look.checker)}}
+        surfaces = {"surface": {**surface, "bsdf": _material(model.cage, look.checker)}}
+        if not look.checker and model.materials:
+            surfaces = _in_materials(model, surface, in_memory)
         if not look.cage:
             return surfaces
         bsdf = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(WIRE_COLOUR)}}
@@ -260,8 +257,6 @@ class CageScenes(SceneSource[PosedModel]):
 def _in_materials(model: Model, surface: SceneNode, in_memory: bool) -> SceneNode:
     """Shapes for the materials of a cage, "surface", "surface_2" and so on, with the same vertices."""
     shapes: SceneNode = {}
-    if not model.materials:
-        return shapes
     tensor: Any = mi.TensorXu  # The stubs call it an object
     for name, faces in model.cage.materials.items():
         material = model.materials.get(name)

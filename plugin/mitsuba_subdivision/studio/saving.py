@@ -53,8 +53,7 @@ def save_scene(
     require_writable(path, inputs)
     parts = _SceneParts(path, [*named, *inputs])
     entries = {
-        name: parts.in_files(name, dict(entry)) if isinstance(entry, Mapping) else entry
-        for name, entry in scene.items()
+        name: parts.in_files(name, entry) if isinstance(entry, Mapping) else entry for name, entry in scene.items()
     }
     text = _as_text(mi.parser.parse_dict(mi.parser.ParserConfig(str(mi.variant())), entries))
     written = parts.write()
@@ -121,7 +120,7 @@ class _SceneParts:
         # Files of cages and rules that stay in the scene, by the identity of their arrays.
         self._cages: dict[tuple[tuple[str, Any], ...], tuple[Path, SceneNode]] = {}
 
-    def in_files(self, name: str, node: SceneNode) -> SceneNode:
+    def in_files(self, name: str, node: Mapping[str, Any]) -> SceneNode:
         """A scene entry with file names in place of data. Raises ValueError for an object of Mitsuba."""
         entry = dict(node)
         if "positions" in node:
@@ -134,7 +133,7 @@ class _SceneParts:
             entry["filename"] = _relative(Path(entry["filename"]), self._path.parent)
         for key, value in entry.items():
             if isinstance(value, Mapping):
-                entry[key] = self.in_files(f"{name}_{key}", dict(value))
+                entry[key] = self.in_files(f"{name}_{key}", value)
             elif isinstance(value, mi.Object):
                 kind = type(value).__name__
                 raise ValueError(f'"{key}" of "{name}" is an object of Mitsuba, {kind}; expected a dictionary to save')
@@ -155,7 +154,7 @@ class _SceneParts:
         self._writers[path] = write
         return path
 
-    def _with_cage(self, name: str, entry: SceneNode) -> SceneNode:
+    def _with_cage(self, name: str, entry: Mapping[str, Any]) -> SceneNode:
         of_cage = {key: value for key, value in entry.items() if key in _OF_CAGE or is_attribute_parameter(key)}
         # Parts of a mesh have the same arrays.
         alike = tuple((key, value if isinstance(value, str) else id(value)) for key, value in of_cage.items())

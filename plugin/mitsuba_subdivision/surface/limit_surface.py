@@ -418,11 +418,9 @@ class LimitSurface:
         from ..kernels.surface_kernel import SurfaceKernel
 
         float_type = float_type_of(variant_name(variant))
-
-        def cells() -> SamplingCells:
-            return SamplingCells.build(self._surface_pieces, self._areas[0])
-
-        kernel = SurfaceKernel(self.pieces(), float_type, cells=cells)
+        kernel = SurfaceKernel(
+            self.pieces(), float_type, cells=lambda: SamplingCells.build(self._surface_pieces, self._areas[0])
+        )
         kernel.set_control_points(self.cage.positions)
         return kernel
 
