@@ -10,7 +10,7 @@ from itertools import pairwise
 import numpy as np
 from mitsuba_subdivision.cage import Attribute, CageContents, CageError, CageSource, require_range, shortened
 from mitsuba_subdivision.files import MeshReader, Skinning, require_types, value_at
-from mitsuba_subdivision.mesh import IntArray
+from mitsuba_subdivision.mesh import IntArray, Topology
 from mitsuba_subdivision.studio import HIGHEST_RATE
 from numpy.typing import NDArray
 from pxr import Usd, UsdGeom, UsdLux, UsdShade
@@ -143,7 +143,8 @@ class ShapeReader:
         constants = {name: self._constant(prim, name) for name in names if name not in cage.attributes}
         constants = {name: values for name, values in constants.items() if values}
         is_double_sided = value_at(UsdGeom.Gprim(prim).GetDoubleSidedAttr(), self._time)
-        if is_double_sided and material is not None and material.is_emissive and _is_open(cage):
+        topology = Topology(len(cage.positions), cage.face_sizes, cage.face_vertices)
+        if is_double_sided and material is not None and material.is_emissive and (topology.twin < 0).any():
             what = "double-sided meshes with a border shine on their front only, as Mitsuba's area lights do"
             self._notes.add(what, prim.GetPath())
         radiance, whole_light = None, None
@@ -190,15 +191,6 @@ class ShapeReader:
         what += "three or four, or two for texture coordinates"
         self._notes.add(what, primvar.GetAttr().GetPath())
         return []
-
-
-def _is_open(cage: CageContents) -> bool:
-    """Whether an edge belongs to one face only."""
-    ends, vertices = np.cumsum(cage.face_sizes), cage.face_vertices
-    following = np.arange(1, len(vertices) + 1)
-    following[ends - 1] = ends - cage.face_sizes
-    edges = np.sort([vertices, vertices[following]], axis=0)
-    return bool((np.unique(edges, axis=1, return_counts=True)[1] == 1).any())
 
 
 def _faces_of(reader: MeshReader, indices: Usd.Attribute, face_count: int, name: str) -> IntArray:

@@ -58,6 +58,13 @@ def test_each_material_is_a_shape_with_its_bsdf(file):
     assert np.isfinite(np.array(mi.render(mi.load_dict(scene), spp=1))).all()
 
 
+def test_names_are_read_as_those_of_faces(tmp_path):
+    """After a byte order mark, and in no known encoding."""
+    (tmp_path / "a.mtl").write_bytes(b"\xef\xbb\xbfnewmtl gr\xfcn\nKd 0 1 0\n")
+    (tmp_path / "a.obj").write_bytes(b"mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl gr\xfcn\nf 1 2 3\n")
+    assert set(read_materials(tmp_path / "a.obj")) == set(ControlCage.from_file(tmp_path / "a.obj").materials)
+
+
 def test_unknown_materials_are_grey_and_warn(file):
     (file.parent / "cube.mtl").write_text("newmtl red\nKd 1 0 0\n")
     with pytest.warns(CageWarning, match='cube.obj": no material library has "lamp"; their faces are grey'):

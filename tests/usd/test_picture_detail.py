@@ -94,6 +94,11 @@ def test_segments_follow_the_size_in_the_picture():
         return _segments(SceneContents(groups=[[shape]], instances=instances), sensor_at(8), "exact")[shape]
 
     assert rate(places) == rate(places[:1]) == near > rate(places[1:]) > rate(places[2:])
+    # A dense part does not hide what a coarse one needs; a tenth of the size may have ten times the error.
+    for size, least in ((1, 0.9), (0.1, 0.1**0.5)):
+        coarse = torus(8, 5).with_positions(size * torus(8, 5).positions)
+        alone, beside = _shape(coarse), _shape(msub.joined_cage([coarse, torus(96, 60)]))
+        assert _rate(beside, sensor_at(8)) >= least * _rate(alone, sensor_at(8))
 
 
 def test_still_pictures_have_adaptive_triangles_where_these_are_fewer():

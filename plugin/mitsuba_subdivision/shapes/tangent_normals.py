@@ -34,7 +34,4 @@ def make_tangent_normals(variant: Variant) -> type:
         def traverse(self, callback: Any) -> None:
             callback.put("normals", self._normals, mi.ParamFlags.Differentiable)
 
-        def to_string(self) -> str:
-            return f"TangentNormals[normals = {self._normals}]"
-
     return TangentNormals

@@ -38,7 +38,7 @@ def read_materials(path: Path) -> dict[str, Material]:
     for names in re.findall(rb"^[ \t]*mtllib[ \t]+(.+?)\s*$", content, re.MULTILINE):
         for library in _libraries(path.parent, names.decode(errors="replace")):
             try:
-                text = library.read_text(encoding="utf-8", errors="replace")
+                text = library.read_text(encoding="utf-8-sig", errors="backslashreplace")
             except OSError:
                 warn(f'"{path}": there is no material library "{library.name}"; its materials are grey')
                 continue

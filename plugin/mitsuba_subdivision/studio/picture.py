@@ -22,8 +22,9 @@ from .studio_entries import variant_in_use
 
 # Largest distance of triangles from the surface in pixels, by shading. With exact shading, only silhouettes show it.
 ERRORS = {"exact": 0.1, "vertex": 0.5 / 4**2}
-# Quantile of vertices for the estimated error: it overestimates borders and creases, and few vertices are at outlines.
-VERTEX_QUANTILE = {"exact": 0.95, "vertex": 0.99}
+# Part of the surface that has at most the estimated error, which is too large at borders and creases; and the largest
+# error anywhere, relative to this.
+SURFACE_QUANTILE, LARGEST_ERROR = {"exact": 0.95, "vertex": 0.99}, 10
 MOST_SEGMENTS, FINEST_RATE = 8, 64  # Most segments on each edge of a cage: of uniform and of adaptive tessellations
 # Most triangles of a scene; and the number of uniform triangles that take as long as choosing adaptive ones.
 MOST_TRIANGLES, FEW_TRIANGLES = 4_000_000, 20_000
@@ -91,7 +92,7 @@ def triangles_for(segments: int, corners: int, most: int, outline: SceneNode, hi
 
 
 def _deviation(cage: ControlCage, shading: str) -> float:
-    """Distance of a cage's faces from its surface, in object space, for most vertices.
+    """Distance of a cage's faces from its surface, in object space, for most of the surface.
 
     On a surface that bends one way with curvature ``k``, chords of length ``h`` are up to ``k h^2 / 8`` away, and
     vertices are ``k h^2 / 4`` away from the middle of their four neighbours. On a surface that bends both ways, both
@@ -99,12 +100,17 @@ def _deviation(cage: ControlCage, shading: str) -> float:
     """
     t = cage.topology
     used = t.vertex_face_count > 0
-    squared = np.zeros(np.count_nonzero(used))
+    squared, sizes = np.zeros(np.count_nonzero(used)), np.zeros(len(t.face_vertices))
     for x in cage.positions.T:
         at_corners = x[t.face_vertices]
         around = np.bincount(t.face_vertices, (at_corners[t.next] + at_corners[t.prev]) / 2, cage.vertex_count)
         squared += np.square(around[used] / t.vertex_face_count[used] - x[used])
-    return float(np.sqrt(np.quantile(squared, VERTEX_QUANTILE[shading])) / 2)
+        sizes += np.square(at_corners[t.next] - at_corners)
+    # Weighted by area: coarse parts of a cage have few vertices.
+    order, area = np.argsort(squared), np.bincount(t.face_vertices, sizes, cage.vertex_count)[used]
+    below = np.cumsum(area[order])
+    typical = squared[order[np.searchsorted(below, SURFACE_QUANTILE[shading] * below[-1])]]
+    return float(np.sqrt(max(typical, squared.max() / LARGEST_ERROR**2)) / 2)
 
 
 def pixels_of_copies(
