@@ -117,8 +117,7 @@ def _cages(path):
             return
         from mitsuba_usd.stage_walk import StageReader
 
-        reader = StageReader(path, None)
-        contents = reader.at(None)
+        contents = StageReader(path, None).at(None)
         shapes = [*contents.shapes, *(shape for group in contents.groups for shape in group)]
         for shape in shapes:
             if shape.cage.scheme is not None:

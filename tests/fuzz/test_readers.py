@@ -37,8 +37,7 @@ def test_valid_files_and_some_damaged_ones_are_cages(reader, tmp_path):
             except CageError:
                 return False
 
-    seeds = seed_files(reader)
-    assert all(is_cage(f"seed{number}", *seed) for number, seed in enumerate(seeds))
+    assert all(is_cage(f"seed{number}", *seed) for number, seed in enumerate(seed_files(reader)))
     damaged = [campaign.damaged_file(reader, 0, number) for number in range(100)]
     assert 0.05 < sum(is_cage(number, *file) for number, file in enumerate(damaged)) / len(damaged) < 0.95
 

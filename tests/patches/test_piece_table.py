@@ -38,8 +38,7 @@ def test_tips_keep_fewer_levels_as_pieces_where_these_would_take_too_much_memory
 
 def test_regular_pieces_do_not_take_levels_from_tips(monkeypatch):
     monkeypatch.setattr(layout, "COEFFICIENT_BYTES", 1)
-    surface = LimitSurface(sheet(5, 4))
-    assert PieceTable.build(surface.patches).piece_levels == PIECE_LEVELS
+    assert PieceTable.build(LimitSurface(sheet(5, 4)).patches).piece_levels == PIECE_LEVELS
 
 
 def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkeypatch):

@@ -148,8 +148,7 @@ def test_derivatives_of_vertices_are_central_differences(named, by, displacement
     (cage, scheme), heights = named, {}
     if displacement:
         heights = {**HEIGHTS, "displacement": bitmap(IMAGE) if displacement == "bitmap" else displacement}
-    shape = load(cage, scheme=scheme, to_world=mi.ScalarTransform4f(matrix), **heights)
-    parameters = mi.traverse(shape)
+    parameters = mi.traverse(load(cage, scheme=scheme, to_world=mi.ScalarTransform4f(matrix), **heights))
     buffers = [f"vertex_{name}" for name in ("positions", "normals", "texcoords", *cage.attributes)]
     sizes = {name: dr.width(parameters[name]) for name in buffers}
     weights = {name: upload(mi.Float, np_rng.normal(size=size) / np.sqrt(size)) for name, size in sizes.items()}

@@ -226,8 +226,7 @@ for shading in ("vertex", "exact"):
 # Many renders, which take most of their time in answers.
 @llvm
 def test_an_interruption_is_raised_after_mitsuba_returns():
-    turns = printed(BEGIN + INTERRUPTED).splitlines()
-    assert [turn.split()[0] for turn in turns] == ["vertex"] * 2 + ["exact"] * 2
+    assert [turn.split()[0] for turn in printed(BEGIN + INTERRUPTED).splitlines()] == ["vertex"] * 2 + ["exact"] * 2
 
 
 @pytest.fixture
