@@ -166,10 +166,3 @@ def bumpy(cage, seed=0, size=0.1):
 
 def polygons(topology):
     return [tuple(map(int, face)) for face in np.split(topology.face_vertices, topology.face_offsets[1:-1])]
-
-
-def creased(cage, sharpness=10.0):
-    t, first = cage.topology, cage.topology.edge_half_edge
-    ends = t.face_vertices[first], t.face_vertices[t.next[first]]
-    creases = np.column_stack([*ends, np.full(len(first), sharpness)])
-    return ControlCage.from_arrays(cage.positions, cage.face_sizes, cage.face_vertices, creases=creases)
