@@ -36,7 +36,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 # Small enough that all together take seconds.
-RESOLUTION, SPP, DPI = 12, 1, 20
+RESOLUTION, SPP = 12, 1
 # These are one picture, wider than those that share a figure, without text.
 STAND_ALONE = ("hero", "displacement")
 # The narrowest figures in millimetres, and points of their smallest text, indices and exponents included.
@@ -49,12 +49,8 @@ def options(tmp_path):
 
 
 @pytest.fixture
-def coarse(monkeypatch):
+def coarse(monkeypatch, few_pixels):  # noqa: ARG001
     """Figures without the pixels, triangles and steps that a printer needs: most of the time goes into these."""
-    from matplotlib.figure import Figure
-
-    save = Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: save(figure, path, **{**more, "dpi": DPI}))
     monkeypatch.setitem(write_figure.__kwdefaults__, "layouts", 1)
     constants = {
         "cages": {"CREASE_RATE": 3},
