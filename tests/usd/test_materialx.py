@@ -316,9 +316,6 @@ def test_unsupported_features_warn_once(stage, tmp_path, text, message):
 ADDRESS = 'string inputs:uaddressmode = "{0}"'
 ADDRESSES = f"{ADDRESS}\n{ADDRESS.replace(':u', ':v')}"
 TEXCOORD = "ND_texcoord_vector2", ""
-SECOND_TEXCOORD = "ND_texcoord_vector2", "int inputs:index = 1"
-# An input of an image, what its coordinates are, and what is told.
-
 OTHER_INPUTS = [
     ('string inputs:layer = "some"', "layer"),
     ('string inputs:filtertype = "closest"', "filtertype"),
@@ -334,7 +331,7 @@ IGNORED_INPUTS = [
     (ADDRESS.format("clamp"), TEXCOORD, "vaddressmode of textures is ignored; uaddressmode applies to both"),
     ("float inputs:gain = 2", TEXCOORD, "does not have are ignored (gain of /Red/image)"),
     ("color3f inputs:default.connect = </Red/tone.outputs:out>", TEXCOORD, "default of images is ignored unless it is"),
-    ("", SECOND_TEXCOORD, "index of texcoord is ignored; the first set of the mesh"),
+    ("", ("ND_texcoord_vector2", "int inputs:index = 1"), "index of texcoord is ignored; the first set of the mesh"),
 ]
 
 
