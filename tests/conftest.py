@@ -84,6 +84,15 @@ def no_other_scene():
 
 
 @pytest.fixture
+def few_pixels(monkeypatch):
+    """Draw plots with few pixels: most of the time to draw one goes into packing them."""
+    from matplotlib.figure import Figure
+
+    save = Figure.savefig
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: save(figure, path, **{**more, "dpi": 20}))
+
+
+@pytest.fixture
 def np_rng():
     return np.random.default_rng(0)
 

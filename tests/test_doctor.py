@@ -23,8 +23,7 @@ def test_the_report_lists_variants_and_packages(monkeypatch, capsys):
 
 
 def test_failing_variants_exit_with_status_1(monkeypatch, capsys):
-    crashed = {"works": False, "problem": "the process crashed (SIGABRT)"}
-    monkeypatch.setattr(doctor, "try_variant", lambda *_: crashed)
+    monkeypatch.setattr(doctor, "try_variant", lambda *_: {"works": False, "problem": "the process crashed (SIGABRT)"})
     assert main(["doctor", "--json"]) == 1
     report = json.loads(capsys.readouterr().out)
     assert report["healthy"] is False

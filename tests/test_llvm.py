@@ -31,8 +31,10 @@ llvm._SYSTEM_FOLDERS = (os.environ["SYSTEM_FOLDER"],)
 
 def run(code, **environment):
     clean = {name: os.environ[name] for name in {*os.environ} - {llvm.ENVIRONMENT_VARIABLE, "LD_LIBRARY_PATH"}}
-    streams = {"capture_output": True, "text": True}
-    return subprocess.run([sys.executable, "-c", code], env=clean | environment, timeout=120, check=False, **streams)
+    given = {"env": clean | environment, "timeout": 120, "capture_output": True, "text": True}
+    done = subprocess.run([sys.executable, "-c", code], check=False, **given)
+    assert done.returncode == 0, done.stderr
+    return done
 
 
 @pytest.fixture
@@ -146,7 +148,6 @@ def test_without_a_usable_library_variants_fail_with_an_exception(tmp_path):
         "print(llvm.best_variant()); mi.set_variant('scalar_rgb')",
         SYSTEM_FOLDER=str(tmp_path),
     )
-    assert done.returncode == 0
     assert done.stdout.split() == ["ImportError", "scalar_rgb"]
     line = done.stderr.splitlines()[-1]
     assert "using the slower variant scalar_rgb" in line
@@ -175,7 +176,6 @@ LLVM = "mi.set_variant('llvm_ad_rgb');"
 )
 def test_aborting_libraries_warn_when_an_llvm_variant_is_set(code, message):
     done = run(code, DRJIT_LIBLLVM_PATH=OLD_LIBRARY)
-    assert done.returncode == 0, done.stderr
     assert done.stderr.startswith("so far\n") == (SCALAR in code)
     assert done.stderr.count("which aborts the process, and needs 17 or newer") == 1
     assert message in done.stderr
@@ -208,7 +208,6 @@ for code in {RUNS_KERNELS!r}:
     else: print("no error:", code)""",
         DRJIT_LIBLLVM_PATH=OLD_LIBRARY,
     )
-    assert done.returncode == 0, done.stderr
     told = done.stdout.splitlines()
     assert len(told) == len(RUNS_KERNELS)
     assert [line for line in told if "Dr.Jit has loaded LLVM" not in line or TOO_LATE not in line] == []

@@ -12,7 +12,6 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from mitsuba_subdivision import example_file, messages
 from mitsuba_subdivision.__main__ import main
 from mitsuba_subdivision.cage.named_cages import cube
@@ -185,11 +184,10 @@ def test_a_picture_of_the_scene_is_no_output(folder, capsys, more):
     assert light.read_bytes() == before
 
 
+@pytest.mark.usefixtures("few_pixels")
 def test_every_command_makes_the_folder_of_its_output(folder, monkeypatch):
     picture = str(folder / "a" / "b" / "picture.exr")
     # Of reports and figures, drawing takes most of the time.
-    save = Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: save(figure, path, **{**more, "dpi": 20}))
     monkeypatch.setitem(write_figure.__kwdefaults__, "layouts", 1)
     assert render("-o", picture, "--spp", "2", "--passes", "1") == 0
     assert main(["merge", picture, "-o", "c/d/merged.exr"]) == 0

@@ -117,10 +117,7 @@ def _cages(path):
             return
         from mitsuba_usd.stage_walk import StageReader
 
-        reader = StageReader(path, None)
-        contents = reader.at(None)
-        shapes = [*contents.shapes, *(shape for group in contents.groups for shape in group)]
-        for shape in shapes:
+        for shape in StageReader(path, None).at(None).all_shapes:
             if shape.cage.scheme is not None:
                 yield cage_of(shape.cage)
 

@@ -70,9 +70,8 @@ def cage_files(name, folder):
     if not all(path.exists() for path in files.values()):
         stem.parent.mkdir(parents=True, exist_ok=True)
         points, quads = MAKERS[name]()
-        cage = ControlCage(points, quads)
         for kind in ("obj", "ply"):
-            cage.save(files[kind])
+            ControlCage(points, quads).save(files[kind])
         arrays = np.array([len(points), len(quads)], np.int32), points.astype(np.float32), quads.astype(np.int32)
         files["bin"].write_bytes(b"".join(array.tobytes() for array in arrays))
     return files

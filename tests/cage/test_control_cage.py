@@ -159,8 +159,7 @@ def test_a_cage_from_its_contents_is_equal(np_rng):
     assert again.source == cage.source
     assert {rule: getattr(again, rule) for rule in RULES} == rules
     box = cube()
-    plain = CageContents(box.positions, box.face_sizes, box.face_vertices)
-    cage = cage_of(plain)
+    cage = cage_of(CageContents(box.positions, box.face_sizes, box.face_vertices))
     assert {rule: getattr(cage, rule) for rule in RULES} == {rule: values[0] for rule, values in RULES.items()}
     assert (cage.scheme, cage.texcoords, cage.attributes, len(cage.holes)) == (None, None, {}, 0)
     assert not cage.tags.any
@@ -197,8 +196,7 @@ def test_every_edge_is_there_once_and_triangles_cover_the_faces(cage):
 
 def test_points_of_refined_edges_come_in_the_order_of_the_edges():
     cage = mixed_torus()
-    step = cage.refinement()
-    points = step.matrix[cage.vertex_count :][: len(cage.edges)]
+    points = cage.refinement().matrix[cage.vertex_count :][: len(cage.edges)]
     rows, columns = np.repeat(np.arange(len(cage.edges)), 2), cage.edges.ravel()
     others = points.toarray()
     ends = others[rows, columns]

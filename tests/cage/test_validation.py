@@ -46,7 +46,6 @@ TURNED = ["counter-clockwise from outside", "(1 such edge;"]
 FOUR_FANS = [[0, 1, 2], [0, 3, 4], [0, 5, 6], [0, 7, 8]]
 TETRAHEDRON = tetrahedron().face_vertices.reshape(-1, 3)
 TETRAHEDRA = [*TETRAHEDRON, *np.where(TETRAHEDRON == 3, 3, TETRAHEDRON + 4)]
-TETRAHEDRON_AND_SHEET = [*TETRAHEDRON, [3, 4, 5], [3, 5, 6]]
 
 
 @pytest.mark.parametrize(
@@ -75,7 +74,7 @@ TETRAHEDRON_AND_SHEET = [*TETRAHEDRON, [3, 4, 5], [3, 5, 6]]
         (FOUR_FANS[:3], ["vertex 0 joins 3 separate fans: face 0 | face 1 | face 2; expected one", "(1 such vertex;"]),
         (FOUR_FANS, ["vertex 0 joins 4 separate fans: face 0 | face 1 | face 2 | ...; expected one fan"]),
         (TETRAHEDRA, ["vertex 3 joins 2 separate fans: faces 0, 2, 3 | faces 4, 6, 7;", "(1 such vertex"]),
-        (TETRAHEDRON_AND_SHEET, ["vertex 3 joins 2 separate fans: faces 0, 2, 3 | faces 4, 5;"]),
+        ([*TETRAHEDRON, [3, 4, 5], [3, 5, 6]], ["vertex 3 joins 2 separate fans: faces 0, 2, 3 | faces 4, 5;"]),
     ],
 )
 @pytest.mark.filterwarnings("ignore::mitsuba_subdivision.cage.CageWarning")

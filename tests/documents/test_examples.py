@@ -47,7 +47,6 @@ MARK = re.compile(r'(in the tests: (add .+|".+" is ".+"|needs \w+|options only)|
 EXTRAS = PROJECT["optional-dependencies"]
 MARKERS = [line.split(":")[0] for line in CONFIGURATION["tool"]["pytest"]["ini_options"]["markers"]]
 OURS, OPTIONS_ONLY = "mitsuba-subdivision", "options only"
-DPI = 20
 # Files that the examples of a page leave, among others.
 WRITTEN = {
     "README": {"artifact.png", "human.png", "rook.png"},
@@ -115,16 +114,10 @@ def blocks(page):
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """A working folder with the repository's scenes; schemes that examples register are forgotten.
-
-    Plots have few pixels: most of the time to draw one goes into packing them.
-    """
-    from matplotlib.figure import Figure
+def folder(tmp_path, monkeypatch, few_pixels):  # noqa: ARG001
+    """A working folder with the repository's scenes; schemes that examples register are forgotten."""
     from mitsuba_subdivision.schemes import scheme
 
-    save = Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: save(figure, path, **{**more, "dpi": DPI}))
     monkeypatch.setattr(scheme, "_SCHEMES", dict(scheme._SCHEMES))
     shutil.copytree(ROOT / "scenes", tmp_path / "scenes")
     monkeypatch.chdir(tmp_path)

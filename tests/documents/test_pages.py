@@ -96,8 +96,7 @@ def test_the_table_of_eigenvalues_follows_the_rules():
         first, *others = regular_signature(scheme).fans
         is_face = scheme.element == "face"
         fan = Fan((scheme.regular_face_size,) * valence if is_face else (valence, *first.ahead[1:]))
-        signature = Signature(scheme.element, (fan, *others))
-        basis = irregular_patch(scheme, signature).basis
+        basis = irregular_patch(scheme, Signature(scheme.element, (fan, *others))).basis
         second, fourth = basis.subdominant, basis.moduli[3]
         assert stated == [f"{value:.4f}" for value in (second, fourth / second, fourth / second**2)], (name, valence)
 

@@ -45,16 +45,14 @@ def test_float32_normals_stay_right_at_every_level(exact, surface):
     uv = np.concatenate([0.9 * np.ldexp([[0.6, 0.45]], -level) for level in range(49)])
     single, precise = (surface.evaluate(0, np.concatenate([exact.uv, uv]), dtype=dtype) for dtype in ("f4", "f8"))
     assert single.n.dtype == np.float32
-    is_narrow = exact.valence > bars.NORMAL_FLOAT32_VALENCES
-    bar = bars.NORMAL_FLOAT32_NARROW if is_narrow else bars.NORMAL_FLOAT32
+    bar = bars.NORMAL_FLOAT32_NARROW if exact.valence > bars.NORMAL_FLOAT32_VALENCES else bars.NORMAL_FLOAT32
     assert angle(single.n, precise.n).max() <= bar
     assert np.abs(single.p - precise.p).max() <= bars.POINT_FLOAT32 * exact.size
 
 
 def test_published_forms_agree_in_points_and_away_from_the_extraordinary_point(exact, surface):
     for evaluator in ("power", "stam") if exact.valence <= 8 else ():
-        samples = surface.evaluate(0, exact.uv, evaluator=evaluator)
-        assert np.abs(samples.p - exact.p).max() <= POINT * exact.size
+        assert np.abs(surface.evaluate(0, exact.uv, evaluator=evaluator).p - exact.p).max() <= POINT * exact.size
     # Term 1 of (11) is about 2^n times the rounding error, of float64 and at n = 1 nothing.
     far = np.flatnonzero(exact.uv.max(axis=1) > 0.25)
     assert_exact(surface.evaluate(0, exact.uv[far], evaluator="stam", derivatives=2), exact, far)

@@ -75,8 +75,7 @@ def as_cage(points, texcoords, options):
     """Cage of points and texture coordinates that the reference has refined."""
     positions = {vertex: point for (vertex, _), point in points.values.items()}
     row = {key: i for i, key in enumerate(texcoords.values)}
-    faces = zip(texcoords.faces, texcoords.indices, strict=True)
-    keys = [key for face in faces for key in zip(*face, strict=True)]
+    keys = [key for face in zip(texcoords.faces, texcoords.indices, strict=True) for key in zip(*face, strict=True)]
     return ControlCage(
         [positions[vertex] for vertex in range(len(positions))],
         points.faces,
@@ -151,8 +150,7 @@ def test_reference_refinements_have_the_same_points_and_values(scheme, cage, mod
     options |= random_tags(cage, rng, share, sharpness)
     indices = random_indices(cage, rng, kind)
     texcoords = face_varying(rng.random((indices.max() + 1, 2)), indices)
-    coarse = tagged(cage, texcoords=texcoords, crease_method=method, **options)
-    assert_refined_alike(coarse, scheme, refinements, rng)
+    assert_refined_alike(tagged(cage, texcoords=texcoords, crease_method=method, **options), scheme, refinements, rng)
 
 
 def test_semi_sharp_edges_hold_values_across_creases_but_not_semi_sharp_vertices_across_seams(np_rng):

@@ -165,8 +165,7 @@ def test_the_end_of_a_sharp_edge_in_a_vertex_of_two_faces_has_no_normal():
     t, around = cage.topology, np.flatnonzero(cage.face_vertices == 8)
     surface = LimitSurface(tagged(cage, creases=[(8, t.face_vertices[t.next[around[0]]], INFINITE)]))
     assert (evaluate_from(surface, around, [[0.0, 0.0]]).n == 0).all()
-    uv = np.ldexp([[1.5, 1.2]], [[-200], [-201], [-202]])
-    first, second, third = evaluate_from(surface, around[:1], uv).n
+    first, second, third = evaluate_from(surface, around[:1], np.ldexp([[1.5, 1.2]], [[-200], [-201], [-202]])).n
     assert first @ second < -0.99
     assert first @ third > 0.99
 
@@ -176,8 +175,7 @@ def test_thin_cages_have_their_normals(thickness):
     """Tangents of very different lengths are exact along axes, and with digits enough along others."""
     scaling = np.array([1, thickness, 1])
     for cage in (bumpy(cube(), 2), tagged(bumpy(cube(), 2), creases=[(0, 1, INFINITE)])):
-        thick = LimitSurface(cage).tessellate(RATE).normals
-        expected = thick / scaling
+        expected = LimitSurface(cage).tessellate(RATE).normals / scaling
         expected /= np.linalg.norm(expected, axis=1, keepdims=True)
         normals, _ = normals_on_every_path(cage.with_positions(cage.positions * scaling))
         assert not assert_unit_or_zero_alike(normals).any()
@@ -193,8 +191,7 @@ def test_results_do_not_depend_on_the_size_of_a_cage(size):
         scaled, _ = normals_on_every_path(cage.with_positions(size * cage.positions))
         for path, of_path in normals.items():
             np.testing.assert_array_equal((of_path == 0).all(axis=1), (scaled[path] == 0).all(axis=1), err_msg=path)
-            tolerance = SINGLE_DIRECTION if path in SINGLE_PATHS else DOUBLE
-            assert np.abs(of_path - scaled[path]).max() < tolerance
+            assert np.abs(of_path - scaled[path]).max() < (SINGLE_DIRECTION if path in SINGLE_PATHS else DOUBLE)
 
 
 @pytest.mark.parametrize("make", [pillow, lens])

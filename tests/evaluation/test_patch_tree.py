@@ -26,8 +26,7 @@ def test_old_and_new_points_of_one_refinement_are_as_many_as_published(valence):
     assert patch.children.shape == (3, 16, old)
     assert len(np.unique(np.vstack([patch.matrix, *patch.children]), axis=0)) == 2 * valence + 17
     for corner in range(4):
-        whole = patch_tree(SCHEME, patch.signature.rotated(corner)).piece
-        assert whole.patch.signature == patch.signature
+        assert patch_tree(SCHEME, patch.signature.rotated(corner)).piece.patch.signature == patch.signature
 
 
 def test_tiles_of_equal_division_are_shared():

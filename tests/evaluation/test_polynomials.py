@@ -36,8 +36,7 @@ def test_bernstein_form_and_its_halves_are_the_same_polynomials_and_bound_them(s
     (u, v), values = basis.derivatives, basis.values(uv)
     assert values.min() >= 0
     np.testing.assert_allclose(values.sum(axis=1), 1, rtol=0, atol=BERNSTEIN)
-    corners = basis.values(scheme.domain.corners)[:, basis.corners]
-    np.testing.assert_array_equal(corners, np.eye(len(basis.corners)))
+    np.testing.assert_array_equal(basis.values(scheme.domain.corners)[:, basis.corners], np.eye(len(basis.corners)))
     operators = (np.eye(len(u)), u, v, u @ u, v @ u, v @ v)
     for operator, expected in zip(operators, scheme.regular_basis(uv, 2), strict=True):
         np.testing.assert_allclose(values @ operator @ of_controls, expected, rtol=0, atol=BERNSTEIN)

@@ -36,7 +36,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 # Small enough that all together take seconds.
-RESOLUTION, SPP, DPI = 12, 1, 20
+RESOLUTION, SPP = 12, 1
 # These are one picture, wider than those that share a figure, without text.
 STAND_ALONE = ("hero", "displacement")
 # The narrowest figures in millimetres, and points of their smallest text, indices and exponents included.
@@ -45,17 +45,12 @@ COLUMN, LEAST_TEXT = 84, 6
 
 @pytest.fixture
 def options(tmp_path):
-    common = {"resolution": RESOLUTION, "spp": SPP}
-    return lambda **other: FigureOptions(tmp_path, **{**common, **other})
+    return lambda **other: FigureOptions(tmp_path, **{"resolution": RESOLUTION, "spp": SPP, **other})
 
 
 @pytest.fixture
-def coarse(monkeypatch):
+def coarse(monkeypatch, few_pixels):  # noqa: ARG001
     """Figures without the pixels, triangles and steps that a printer needs: most of the time goes into these."""
-    from matplotlib.figure import Figure
-
-    save = Figure.savefig
-    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **more: save(figure, path, **{**more, "dpi": DPI}))
     monkeypatch.setitem(write_figure.__kwdefaults__, "layouts", 1)
     constants = {
         "cages": {"CREASE_RATE": 3},
@@ -113,8 +108,7 @@ def test_figures_are_drawn_without_warnings_and_fit_for_print(name, options):
     again = {RENDERED_TWICE: ("exr",), WRITTEN_TWICE: figure.formats}.get(name, ())
     if again:
         assert drawn(again).items() <= first.items()
-    pypdf = pytest.importorskip("pypdf")
-    page = pypdf.PdfReader(options().output / f"{name}.pdf").pages[0]
+    page = pytest.importorskip("pypdf").PdfReader(options().output / f"{name}.pdf").pages[0]
     assert float(page.mediabox.width) == pytest.approx(COLUMN / 25.4 * 72)
     sizes = []
     page.extract_text(visitor_text=lambda text, _cm, _tm, _font, size: sizes.append(size) if text.strip() else None)
@@ -132,8 +126,7 @@ def users_cage(tmp_path):
     """A bent box with two creases, far from the origin and not of the size of any figure."""
     positions = 30 * cube().positions * [1, 0.7, 1.5] + [50, -20, 10] + np.random.default_rng(3).normal(size=(8, 3))
     faces = cube().face_vertices.reshape(-1, 4)
-    cage = ControlCage(positions, faces, creases=[[*cube().edges[0], 2.5], [*cube().edges[1], 10]])
-    cage.save(tmp_path / "own.obj")
+    ControlCage(positions, faces, creases=[[*cube().edges[0], 2.5], [*cube().edges[1], 10]]).save(tmp_path / "own.obj")
     return tmp_path / "own.obj"
 
 
@@ -166,8 +159,7 @@ def test_centres_of_faces_count_only_if_a_cage_has_no_other_extraordinary_vertex
 def test_the_whole_cage_is_in_the_picture_of_creases():
     sensor = load_stage("creases", width=20, height=31).sensors()[0]
     for shape in ([1, 1, 1], [9, 1, 1], [1, 9, 0.1], [0.1, 0.1, 9]):
-        cage = cube().with_positions(7 + cube().positions * shape)
-        shown = staging.in_view(cage, sensor)
+        shown = staging.in_view(cube().with_positions(7 + cube().positions * shape), sensor)
         x, y = project(sensor, shown.positions).T
         assert min(x.min(), y.min(), 20 - x.max(), 31 - y.max()) > 0
         # It fills the picture in one direction, but for the margin and a step of its sizes.
@@ -261,8 +253,7 @@ def test_the_distance_of_spheres_is_the_difference_of_their_radii():
 
 
 def test_numbers_are_on_visible_edges():
-    seen = fit.in_front(cube(), np.array([5.0, -6, 4]))
-    hidden = cube().positions[cube().edges[~seen]]
+    hidden = cube().positions[cube().edges[~fit.in_front(cube(), np.array([5.0, -6, 4]))]]
     # Those that meet in the corner across.
     assert len(hidden) == 3
     assert (hidden == [-1, 1, -1]).all(axis=2).any(axis=1).all()
@@ -324,8 +315,7 @@ def test_the_displaced_jar_has_no_step_at_its_seam_and_plain_ends():
     along = (np.arange(scenes.ROWS) + 0.5) / scenes.ROWS
     assert not heights[(along < scenes.LOWEST) | (along > scenes.HIGHEST)].any()
     assert 0.9 < heights.max() <= 1
-    cage = ControlCage.from_file(example_file("cages/jar.obj"))
-    assert set(cage.tags.edges) == {0, 10}
+    assert set(ControlCage.from_file(example_file("cages/jar.obj")).tags.edges) == {0, 10}
 
 
 @pytest.mark.core
@@ -429,8 +419,7 @@ def test_failing_programs_report_the_reason(answering):
 def test_opensubdivs_samples_are_its_answers(tmp_path, answering):
     answers = {"p": [1.0, 2, 3, 4, 5, 6], "du": [2.0, 0, 0, 0, 0, 0], "dv": [0, 3.0, 0, 1, 0, 0]}
     answers = peers.as_bytes({name: np.array(values) for name, values in answers.items()})
-    program = answering("osd_peer", "", answers)
-    points, normals = peers.osd_samples(program, cube(), 3, [[0.5, 0.25], [1, 0]], "far", 2)
+    points, normals = peers.osd_samples(answering("osd_peer", "", answers), cube(), 3, [[0.5, 0.25], [1, 0]], "far", 2)
     assert np.array_equal(points, [[1, 2, 3], [4, 5, 6]])
     # Where a derivative vanishes there is no normal.
     assert np.array_equal(normals, [[0, 0, 1], [np.nan] * 3], equal_nan=True)

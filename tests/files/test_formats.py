@@ -87,9 +87,8 @@ def test_a_missing_package_is_named(suffix, module, name, tmp_path, monkeypatch)
     path = tmp_path / f"cube{suffix}"
     cube().save(path)
     monkeypatch.setitem(sys.modules, module, None)
-    message = rf'the package {name}, .* pip install "mitsuba-subdivision\[files\]"'
     for act in (ControlCage.from_file, *([cube().save] if module == "pxr" else [])):
-        with pytest.raises(CageError, match=message):
+        with pytest.raises(CageError, match=rf'the package {name}, .* pip install "mitsuba-subdivision\[files\]"'):
             act(path)
 
 

@@ -1,12 +1,11 @@
 import re
 import time
-import warnings
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage, contents
+from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage, contents, without_warnings
 from mitsuba_subdivision.cage.contents import same
 from mitsuba_subdivision.cage.named_cages import extraordinary
 from mitsuba_subdivision.files.obj import read_obj
@@ -45,8 +44,7 @@ def absolute(index, above):
 
 
 def read_quietly(path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CageWarning)
+    with without_warnings():
         return read_obj(path)
 
 
@@ -210,12 +208,8 @@ SHEET = "v 0 0 0\nv 1 0 0\nv 2 0 0\nv 0 1 0\nv 1 1 0\nv 2 1 0\nf 1 2 5 4\nf 2 3 
 
 
 @pytest.fixture
-def read(tmp_path):
-    def read(text, **options):
-        (tmp_path / "cage.obj").write_text(SHEET + text)
-        return ControlCage.from_file(tmp_path / "cage.obj", **options)
-
-    return read
+def read(obj_file):
+    return lambda text, **options: ControlCage.from_file(obj_file(SHEET + text), **options)
 
 
 def sharp_edges(cage):
@@ -280,7 +274,7 @@ WITHOUT_EFFECT = {
 @pytest.mark.parametrize(("tag", "message"), WITHOUT_EFFECT.items())
 def test_a_short_warning_names_tags_without_effect(read, tag, message):
     shown = tag if len(tag) < 100 else r"vertexedit 100/0/0 0 0 [ 0]*\.\.\."
-    with pytest.warns(CageWarning, match=rf'cage.obj", line 9: tag "{shown}" {message}'):
+    with pytest.warns(CageWarning, match=rf'cube.obj", line 9: tag "{shown}" {message}'):
         read(f"t {tag}\n")
 
 
@@ -312,7 +306,7 @@ WRONG_TAGS = [
 
 @pytest.mark.parametrize(("tag", "message"), WRONG_TAGS)
 def test_errors_of_wrong_tags_are_short_and_name_their_line(read, tag, message):
-    with pytest.raises(CageError, match=f'cage.obj", line 9: {message}') as caught:
+    with pytest.raises(CageError, match=f'cube.obj", line 9: {message}') as caught:
         read(f"t {tag}\n")
     assert len(str(caught.value)) < 600
 
@@ -344,7 +338,7 @@ def test_a_malformed_line_among_many_tags_is_named(read):
         read("t crease 2/1/0 4 1 10\nt crease 2/1/0 4 1.0 10\nt crease 2/1/0 1 4 2\n")
     ignored = {"crease 2/1/0 4 99 10": r"crease along edge \(5, 100\)", "corner 1/1/0 6 10": "corner at vertex 7"}
     for tag, message in ignored.items():
-        with pytest.warns(CageWarning, match=f'cage.obj", line 10: {message}, which'):
+        with pytest.warns(CageWarning, match=f'cube.obj", line 10: {message}, which'):
             read(f"t crease 2/1/0 4 1 10\nt {tag}\n")
 
 

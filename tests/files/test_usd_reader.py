@@ -100,8 +100,7 @@ def test_creases_corners_and_holes(read):
     cage = read(TAGS)
     assert sharp_edges(cage) == {(3, 4): 2.5, (1, 4): 2.5, (0, 1): 2.5, (1, 2): 10}
     assert (cage.contents.corners.tolist(), cage.holes.tolist()) == ([[0, 1.5], [5, 10]], [1])
-    per_edge = read(CREASES.format([3, 4, 1, 2, 5], [3, 2], [1, 2, 3]))
-    assert sharp_edges(per_edge) == {(3, 4): 1, (1, 4): 2, (2, 5): 3}
+    assert sharp_edges(read(CREASES.format([3, 4, 1, 2, 5], [3, 2], [1, 2, 3]))) == {(3, 4): 1, (1, 4): 2, (2, 5): 3}
 
 
 UV = """texCoord2f[] primvars:{0} = [(0, 0), (.5, 0), (1, 0), (0, 1), (1, 1)] (interpolation = "faceVarying")
@@ -195,8 +194,7 @@ MOVING = stated("point3f[] points", {1: HEIGHTS[0], 3: HEIGHTS[1]})
     [(None, 1, 4), (0, 1, 4), (1, 1, 4), (2, 1.5, 4), (2.5, 1.75, 5), (3, 2, 6), (4, 2, 8), (100, 2, 8)],
 )
 def test_points_and_transforms_at_a_time(read, time, height, shift):
-    move = moved(translate={2: (4, 0, 0), 4: (8, 0, 0)})
-    cage = read(old=POINTS_LINE, new=MOVING, transform=move, time=time)
+    cage = read(old=POINTS_LINE, new=MOVING, transform=moved(translate={2: (4, 0, 0), 4: (8, 0, 0)}), time=time)
     np.testing.assert_array_equal(cage.positions, np.add(HEIGHTS[0], [shift, 0, height - 1]))
 
 
@@ -206,8 +204,7 @@ def test_every_operation_of_a_transform_has_its_own_first_time(read):
         double3 xformOp:translate:fixed = (0, 0, 2)
         double3 xformOp:translate:fixed.timeSamples = { 1: (0, 0, 7) }
         uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:translate:late", "xformOp:translate:fixed"]"""
-    cage = read(transform=move)
-    np.testing.assert_array_equal(cage.positions, np.add(POINTS, [4, 1, 2]))
+    np.testing.assert_array_equal(read(transform=move).positions, np.add(POINTS, [4, 1, 2]))
 
 
 SAMPLED_POINTS = [
@@ -264,8 +261,7 @@ def test_one_of_several_meshes_is_chosen_by_its_path(read):
             read(more=more, prim=path)
     more = 'class "Model" {' + TRIANGLE.format("part") + "}\n"
     more += prim("Xform", "a", moved(translate=(5, 0, 0)), head="instanceable = true\ninherits = </World/Model>")
-    positions = read(more=more, prim="/World/a/part").positions
-    np.testing.assert_array_equal(positions, [[5, 0, 0], [6, 0, 0], [5, 1, 0]])
+    np.testing.assert_array_equal(read(more=more, prim="/World/a/part").positions, [[5, 0, 0], [6, 0, 0], [5, 1, 0]])
 
 
 COUNTS, INDEXED_ST = "int[] faceVertexCounts = [4, 4]", UV.format("st")

@@ -42,8 +42,7 @@ def test_points_equal_the_refined_tagged_cage(name, method, np_rng):
             cage = cage.refined(scheme)
         np.testing.assert_allclose(positions, cage.positions, rtol=0, atol=ROUNDING)
         np.testing.assert_array_equal(unknown.refined.face_vertices, cage.face_vertices)
-        expected = LimitSurface(cage, scheme).tessellate(2).positions
-        np.testing.assert_allclose(samples, expected, rtol=0, atol=ROUNDING)
+        np.testing.assert_allclose(samples, LimitSurface(cage, scheme).tessellate(2).positions, rtol=0, atol=ROUNDING)
 
 
 @pytest.mark.core

@@ -2,13 +2,12 @@
 
 import os
 import time
-import warnings
 
 import pytest
 from fuzz import campaign
 from fuzz.campaign import run
 from fuzz.seed_files import seed_files
-from mitsuba_subdivision.cage import CageError, CageWarning, ControlCage
+from mitsuba_subdivision.cage import CageError, ControlCage, without_warnings
 
 # About two seconds each.
 COUNTS = {"obj": 2000, "ply": 2000, "usd": 300}
@@ -30,15 +29,13 @@ def test_valid_files_and_some_damaged_ones_are_cages(reader, tmp_path):
     def is_cage(name, suffix, content):
         path = tmp_path / f"{name}{suffix}"
         path.write_bytes(content)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", CageWarning)
+        with without_warnings():
             try:
                 return bool(ControlCage.from_file(path, **campaign.OPTIONS[reader]))
             except CageError:
                 return False
 
-    seeds = seed_files(reader)
-    assert all(is_cage(f"seed{number}", *seed) for number, seed in enumerate(seeds))
+    assert all(is_cage(f"seed{number}", *seed) for number, seed in enumerate(seed_files(reader)))
     damaged = [campaign.damaged_file(reader, 0, number) for number in range(100)]
     assert 0.05 < sum(is_cage(number, *file) for number, file in enumerate(damaged)) / len(damaged) < 0.95
 

@@ -7,7 +7,6 @@ may be doubled, its border closed by a copy of itself, which makes surfaces that
 import argparse
 import sys
 import traceback
-import warnings
 from collections import Counter
 from pathlib import Path
 
@@ -16,7 +15,8 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurface, SchemeError
+from mitsuba_subdivision import CageError, ControlCage, LimitSurface, SchemeError
+from mitsuba_subdivision.cage import without_warnings
 from mitsuba_subdivision.evaluation.equations import AT_EXTRAORDINARY_POINT
 from mitsuba_subdivision.mesh.connectivity import VertexRule
 from peers.fidelity_cages import edges_of, triangulated
@@ -260,8 +260,7 @@ def tessellation_problem(surface):
 def outcome(seed):
     """What one random cage shows: "ok", "refused ..", or what is wrong; and how many normals are zero, if compared."""
     rng = np.random.default_rng(seed)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CageWarning)
+    with without_warnings():
         try:
             surface = LimitSurface(*random_cage(rng))
         except CageError:

@@ -98,8 +98,7 @@ def outline(shape, *, emits=False, resolution=32):
 
 
 def outline_of(surface, rate=RATE, *, emits=False, **more):
-    shape = described(surface.cage, scheme=surface.scheme.name, tessellation_rate=rate, **more)
-    return outline(shape, emits=emits)
+    return outline(described(surface.cage, scheme=surface.scheme.name, tessellation_rate=rate, **more), emits=emits)
 
 
 def change(surface, direction, rate=RATE):

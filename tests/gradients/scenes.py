@@ -30,8 +30,7 @@ def sky(kind):
         value = np.maximum((d @ axis - 0.75) / 0.25, 0) ** 2
     else:
         value = 1 + 0.4 * d[..., 2] + 0.5 * d[..., 0]
-    colour = np.array([1, 0.8, 0.6])
-    return {"type": "envmap", "bitmap": mi.Bitmap((value[..., None] * colour).astype(np.float32))}
+    return {"type": "envmap", "bitmap": mi.Bitmap((value[..., None] * np.array([1, 0.8, 0.6])).astype(np.float32))}
 
 
 def materials():

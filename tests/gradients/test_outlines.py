@@ -62,8 +62,7 @@ def test_derivatives_by_size_of_lit_surfaces_are_differences_of_their_pictures(c
 @pytest.mark.parametrize(("name", "mirror", "flip"), [("bumpy", 1, True), ("open", -1, False), ("creased", -1, True)])
 def test_outlines_are_sampled_on_the_visible_triangle(name, mirror, flip):
     """From the eye, and along any direction: it is the one that rays beside the edge meet first."""
-    to_world = mi.ScalarTransform4f().scale([mirror, 1, 1])
-    placed = {"flip_normals": flip, "to_world": to_world, "shading": "exact"}
+    placed = {"flip_normals": flip, "to_world": mi.ScalarTransform4f().scale([mirror, 1, 1]), "shading": "exact"}
     scene = scene_with(shape=described(LIT_CAGES[name](), tessellation_rate=RATE, **placed))
     parameters = mi.traverse(scene)
     dr.enable_grad(points := mi.Float(parameters[POINTS]))

@@ -49,10 +49,9 @@ def test_forward_reverse_and_differences_agree(name, tessellation, mirror, np_rn
     arrays = sys.modules["drjit.llvm.ad"]
     surface, start = ALL[name](), MATRIX @ np.diag([mirror, 1, 1, 1])
     table, positions = table_of(surface, tessellation), surface.cage.positions
-    kernel = VertexKernel(table, arrays.Float64)
 
     def vertices(points, matrix):
-        return placed(*kernel(points), matrix, arrays.Array3f64)
+        return placed(*VertexKernel(table, arrays.Float64)(points), matrix, arrays.Array3f64)
 
     # In lengths of edges, which say how soon differences bend.
     edge = np.linalg.norm(np.diff(positions[surface.cage.edges], axis=1), axis=2).min()

@@ -82,8 +82,7 @@ def test_values_are_the_channels(surface, variant, np_rng):
 def test_derivatives_are_differences(surface, np_rng):
     element, uv, corner = random_locations(surface, np_rng, 300, deepest=1)
     # Away from the sides of the domain and from lines on which pieces meet.
-    domain = surface.scheme.domain
-    kept = (domain.inside(uv) > 0.01) & (np.abs(uv % 0.25 - 0.125).max(axis=1) < 0.12)
+    kept = (surface.scheme.domain.inside(uv) > 0.01) & (np.abs(uv % 0.25 - 0.125).max(axis=1) < 0.12)
     element, uv, corner = element[kept], uv[kept], corner[kept]
     for name in surface.attribute_names:
         _, *derivatives = evaluated(surface, name, DOUBLE, element, uv, corner)

@@ -32,10 +32,8 @@ def test_rays_hit_their_target_points(name, variant, np_rng):
     # A few rays meet another part of the surface that is as near.
     assert (np.linalg.norm(p - target, axis=1)[met] <= 10 * ON_RAY[variant]).mean() > 0.99
     # The location of a hit is where the point lies.
-    again = kernel.at(hits.location)
-    np.testing.assert_allclose(vectors(again.p), p, rtol=0, atol=POINT[variant])
-    inside = surface.scheme.domain.inside(np.array([hits.location.u, hits.location.v]).T)
-    assert inside.min() >= 0
+    np.testing.assert_allclose(vectors(kernel.at(hits.location).p), p, rtol=0, atol=POINT[variant])
+    assert surface.scheme.domain.inside(np.array([hits.location.u, hits.location.v]).T).min() >= 0
     if variant == DOUBLE:
         # Half of the points are too far away, along the line.
         lengths = 0.1 * np.linalg.norm(d, axis=1)
@@ -76,8 +74,7 @@ def test_lines_past_a_border_end_at_the_same_point_from_any_corner(variant, beyo
     for turns in (1, 2, 3):
         _, turned, _, turned_values = met_past_a_border(kernel, surface, beyond, turns)
         np.testing.assert_array_equal(turned.half_edge, location.half_edge)
-        both = vectors(turned_values.value), vectors(values.value)
-        np.testing.assert_allclose(*both, rtol=0, atol=ON_RAY[variant])
+        np.testing.assert_allclose(vectors(turned_values.value), vectors(values.value), rtol=0, atol=ON_RAY[variant])
 
 
 @pytest.mark.parametrize("depth", [7, 8, 11, 14, 15])

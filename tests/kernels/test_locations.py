@@ -121,8 +121,7 @@ def test_corners_of_triangles_are_vertices(name, rate):
     b1, b2 = (np.tile(weights, count).astype(float) for weights in ((0, 1, 0), (0, 0, 1)))
     corners = locations(types.indices(triangle), types.floats(b1), types.floats(b2))
     dr.eval(corners)
-    elements = surface.patches.elements
-    np.testing.assert_array_equal(elements.face[np.array(corners.half_edge)], table.element[triangle])
+    np.testing.assert_array_equal(surface.patches.elements.face[np.array(corners.half_edge)], table.element[triangle])
     np.testing.assert_allclose(vectors(kernel.at(corners).p), expected[table.triangles.ravel()], rtol=0, atol=POINT)
 
 

@@ -57,9 +57,8 @@ def test_gradients_recorded_in_one_thread_run_in_many(surface, float_type, np_rn
     """Earlier, the second run wrote beyond its array."""
     table, threads = surface.sampling(5), dr.thread_count()
     kernel, points = VertexKernel(table, float_type), upload(float_type, surface.cage.positions)
-    change = np_rng.standard_normal((2, 3 * table.vertex_count))
     # Arguments of the gradients by points and by normals
-    arguments = points, *(upload(float_type, part) for part in change)
+    arguments = points, *(upload(float_type, part) for part in np_rng.standard_normal((2, 3 * table.vertex_count)))
     try:
         dr.set_thread_count(1)
         expected = np.array(kernel.gradient(*arguments))

@@ -98,8 +98,7 @@ def test_data_at_the_corners_of_turned_faces_stays_at_their_vertices():
     cage, whole = ControlCage(plain.positions, faces, texcoords=given), tagged(plain, texcoords=at_vertices)
     assert np.array_equal(cage.texcoords.indices, cage.face_vertices)
     for face in range(6):
-        first = cage.face_vertices[4 * face]
-        corner = plain.face_vertices[4 * face :][:4].tolist().index(first)
+        corner = plain.face_vertices[4 * face :][:4].tolist().index(cage.face_vertices[4 * face])
         uv = np.array([[0.0, 0.0], [0.3, 0.3]])
         ours = msub.LimitSurface(cage).evaluate_attribute("texcoords", face, uv)
         theirs = msub.LimitSurface(whole).evaluate_attribute("texcoords", face, uv, corner)

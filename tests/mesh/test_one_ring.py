@@ -113,9 +113,8 @@ def test_a_face_is_the_same_from_both_ends_of_its_edge():
     topology = cube_with_valence_2(beside_triangle=True).topology
     (a, _, c, d), triangle, beyond = polygons(topology)[:3]
     assert (triangle, beyond[:2]) == ((a, d, c), (a, c))
-    ring = one_ring(signature_at(topology, 0, "face"))
     # All but the bottom of the cube, each once.
-    assert ring.topology.face_count == 7
+    assert one_ring(signature_at(topology, 0, "face")).topology.face_count == 7
 
 
 def test_a_face_is_named_by_the_first_walk_that_arrives_there():

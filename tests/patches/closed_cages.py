@@ -20,14 +20,12 @@ def torus(columns, rows, major_radius=2.0, minor_radius=1.0):
     positions = np.stack([radius * np.cos(around_axis), radius * np.sin(around_axis), height], axis=1)
     next_column, next_row = (column + 1) % columns, (row + 1) % rows
     corners = [(column, row), (next_column, row), (next_column, next_row), (column, next_row)]
-    faces = np.stack([c * rows + r for c, r in corners], axis=1)
-    return ControlCage(positions, faces, source=CageSource("torus"))
+    return ControlCage(positions, np.stack([c * rows + r for c, r in corners], axis=1), source=CageSource("torus"))
 
 
 def tetrahedron():
     positions = [[1, 1, 1], [-1, -1, 1], [-1, 1, -1], [1, -1, -1]]
-    faces = [[0, 1, 3], [0, 2, 1], [0, 3, 2], [1, 2, 3]]
-    return ControlCage(positions, faces, source=CageSource("tetrahedron"))
+    return ControlCage(positions, [[0, 1, 3], [0, 2, 1], [0, 3, 2], [1, 2, 3]], source=CageSource("tetrahedron"))
 
 
 def extraordinary_triangles(valence, rows=4):
@@ -92,8 +90,7 @@ def trapezohedron(n=7):
 def cube_with_valence_2(*, beside_triangle=False):
     """Cube with two quads, or a quad and a triangle, that meet in two edges at a vertex of valence 2."""
     cube = named_cages.cube()
-    faces = cube.face_vertices.reshape(-1, 4).tolist()
-    (a, b, c, d), *others = faces[::-1]
+    (a, b, c, d), *others = cube.face_vertices.reshape(-1, 4).tolist()[::-1]
     middle = cube.positions[[a, b, c, d]].mean(axis=0)
     rest = [(a, 8, c), (a, c, d)] if beside_triangle else [(a, 8, c, d)]
     return ControlCage([*cube.positions, middle], [(a, b, c, 8), *rest, *others])
@@ -169,10 +166,3 @@ def bumpy(cage, seed=0, size=0.1):
 
 def polygons(topology):
     return [tuple(map(int, face)) for face in np.split(topology.face_vertices, topology.face_offsets[1:-1])]
-
-
-def creased(cage, sharpness=10.0):
-    t, first = cage.topology, cage.topology.edge_half_edge
-    ends = t.face_vertices[first], t.face_vertices[t.next[first]]
-    creases = np.column_stack([*ends, np.full(len(first), sharpness)])
-    return ControlCage.from_arrays(cage.positions, cage.face_sizes, cage.face_vertices, creases=creases)

@@ -51,8 +51,7 @@ def distances_by_evaluation(surface, points, samples, start, uv, spacing):
             locations = np.clip(locations - np.maximum(locations.sum(axis=2, keepdims=True) - 1, 0) / 2, 0, 1)
         samples_near = surface._sampler.evaluate(np.repeat(start, len(STEPS)), locations.reshape(-1, 2))
         away = np.linalg.norm(samples_near.p.reshape(*locations.shape[:2], 3) - points[:, None], axis=2)
-        best = away.argmin(axis=1)
-        uv = locations[np.arange(len(points)), best]
+        uv = locations[np.arange(len(points)), away.argmin(axis=1)]
         distance, spacing = np.minimum(distance, away.min(axis=1)), spacing / 2
     return distance
 

@@ -77,8 +77,7 @@ def test_boxes_are_tight(make, name):
 
 
 def test_boxes_of_flat_elements_are_the_elements():
-    surface = LimitSurface(sheet(4, 3))
-    inner = surface.bounds([5])
+    inner = LimitSurface(sheet(4, 3)).bounds([5])
     np.testing.assert_allclose([inner.lower, inner.upper], [[[1, 1, 0]], [[2, 2, 0]]], rtol=0, atol=1e-5)
 
 

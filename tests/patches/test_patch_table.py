@@ -43,8 +43,7 @@ def test_classes_group_patches_by_signature_and_one_ring(scheme, cage):
         assert {*signatures_of(table, patch_class.corners)} == {patch_class.signature}
         ring, of_class = one_ring(patch_class.signature), table.controls_of(patch_class)
         assert of_class.shape == (len(patch_class.corners), ring.vertex_count)
-        half_edges = table.half_edge_of_corner[patch_class.corners]
-        for controls, half_edge in zip(of_class, half_edges, strict=True):
+        for controls, half_edge in zip(of_class, table.half_edge_of_corner[patch_class.corners], strict=True):
             alone = RingTable(table.topology, [ring], np.array([half_edge]), np.array([1]))
             np.testing.assert_array_equal(controls, alone.vertices)
             assert controls[0] == table.topology.face_vertices[half_edge]
@@ -110,8 +109,7 @@ def test_codes_are_equal_and_ordered_as_rows_are(np_rng, widths, count):
     # Few distinct values over wide ranges: rows repeat, and ranges multiply beyond any integer.
     columns = [np_rng.choice(np_rng.integers(-width, width, 4), count) for width in widths]
     rows = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)[1].ravel()
-    codes = row_codes(columns)
-    np.testing.assert_array_equal(np.unique(codes, return_inverse=True)[1].ravel(), rows)
+    np.testing.assert_array_equal(np.unique(row_codes(columns), return_inverse=True)[1].ravel(), rows)
 
 
 def test_many_codes_of_many_rows_are_numbered_anew(np_rng):

@@ -38,8 +38,7 @@ def test_tips_keep_fewer_levels_as_pieces_where_these_would_take_too_much_memory
 
 def test_regular_pieces_do_not_take_levels_from_tips(monkeypatch):
     monkeypatch.setattr(layout, "COEFFICIENT_BYTES", 1)
-    surface = LimitSurface(sheet(5, 4))
-    assert PieceTable.build(surface.patches).piece_levels == PIECE_LEVELS
+    assert PieceTable.build(LimitSurface(sheet(5, 4)).patches).piece_levels == PIECE_LEVELS
 
 
 def test_copies_of_control_points_share_a_value_and_refined_ones_a_column(monkeypatch):
@@ -66,8 +65,7 @@ def test_parts_of_equal_division_share_pieces():
     """A semi-sharp crease has thousands of pieces, of few kinds."""
     surface = LimitSurface(tagged(cube(), creases=[(4, 5, 8.0), (5, 7, 8.0), (7, 6, 8.0), (6, 4, 8.0)]))
     elements = patch_trees(surface.scheme, [patch_class.signature for patch_class in surface.patches.classes])
-    trees = (layout.tree_arrays(element) for element in elements)
-    pieces = [of_part for tree in trees for *_, of_part in tree.maps]
+    pieces = [of_part for element in elements for *_, of_part in layout.tree_arrays(element).maps]
     count = sum(map(len, pieces))
     assert count > 3000
     assert sum(len(shared) for shared in {id(shared): shared for shared in pieces}.values()) < count / 3

@@ -163,8 +163,7 @@ def _catmull_clark():
 
 
 def _chaikin():
-    unequal = [1.0, 2.5, 0.5, 3.0, 1.75]
-    ring = [(a, b, s) for (a, b), s in zip(lathe_ring(1), unequal, strict=True)]
+    ring = [(a, b, s) for (a, b), s in zip(lathe_ring(1), [1.0, 2.5, 0.5, 3.0, 1.75], strict=True)]
     chain = [(5 + i, 6 + i, s) for i, s in enumerate([0.5, 2.0, 3.0, 1.0])]
     plain = {
         "equal ring": lathe(creases=rings({1: 2.5})),
@@ -210,8 +209,7 @@ def _loop():
             for s in (1.75, INFINITE):
                 sharpness = dict.fromkeys(spokes, s)
                 cages[f"{name} of {s:g} at valence {valence}"] = spoked(valence, sharpness, triangles=True)
-    beside = {1: INFINITE, 4: INFINITE, 2: 1.5, 5: 0.75}
-    cages["semi-sharp beside a crease"] = spoked(6, beside, triangles=True)
+    cages["semi-sharp beside a crease"] = spoked(6, {1: INFINITE, 4: INFINITE, 2: 1.5, 5: 0.75}, triangles=True)
     cages["three semi-sharp edges"] = spoked(5, {1: 0.5, 2: 1.5, 4: 2.5}, triangles=True)
     return {f"Loop, {name}": cage for name, cage in cages.items()}
 

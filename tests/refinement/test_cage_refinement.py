@@ -160,8 +160,7 @@ def test_every_kind_of_attribute_is_refined(np_rng):
 def test_values_without_seams_are_refined_under_doo_sabin(np_rng):
     cage = mixed_torus()
     values = np_rng.random((cage.vertex_count, 2))
-    texcoords = Attribute(values, "face_varying", cage.face_vertices)
-    plain = tagged(cage, texcoords=texcoords, attributes={"heat": values})
+    plain = tagged(cage, texcoords=Attribute(values, "face_varying", cage.face_vertices), attributes={"heat": values})
     check_refined(LimitSurface(plain, "doo_sabin"), np_rng)
     varying = tagged(cage, attributes={"heat": Attribute(values, "varying")})
     with pytest.raises(SchemeError, match='no rules for linear interpolation, as of the attribute "heat"'):
@@ -177,8 +176,7 @@ def test_the_rule_for_seams_changes_to_keep_corners(np_rng):
 @pytest.mark.parametrize("mode", ["none", "corners_plus1", "boundaries"])
 def test_seams_along_semi_sharp_edges_of_unequal_sharpness_are_kept(mode, np_rng):
     creases = [(0, 1, 2.5), (0, 4, 1.25), (0, 2, 3.0)]
-    cage = with_islands(fan(6, creases=creases, crease_method="chaikin"), [(0, 1), (0, 4)], mode)
-    surface = LimitSurface(cage)
+    surface = LimitSurface(with_islands(fan(6, creases=creases, crease_method="chaikin"), [(0, 1), (0, 4)], mode))
     for _ in range(3):
         surface = check_refined(surface, np_rng)
         assert surface.cage.face_varying == mode
@@ -225,8 +223,7 @@ def test_schemes_with_their_own_numbering_are_errors():
     [(None, [[0, 1, 2, 2]]), (None, [[3, 4, 4], [1, 5, 3, 4, 0], [1, 2, 3]]), ("loop", [[1, 0, 1]])],
 )
 def test_halves_of_an_edge_from_a_vertex_to_itself_stay_apart(scheme, faces, np_rng):
-    cage = ControlCage(np_rng.random((6, 3)), faces)
-    check_refined(LimitSurface(cage, scheme), np_rng, times=2)
+    check_refined(LimitSurface(ControlCage(np_rng.random((6, 3)), faces), scheme), np_rng, times=2)
 
 
 def test_holes_stay_holes_where_the_boundary_makes_them():

@@ -14,8 +14,7 @@ RESOLUTION = 64
 
 
 def scene_of(valence, **parameters):
-    path = SCENES / f"valence{valence}.xml"
-    return load_scene(path, {"resolution": RESOLUTION, **parameters}, "box").scene
+    return load_scene(SCENES / f"valence{valence}.xml", {"resolution": RESOLUTION, **parameters}, "box").scene
 
 
 def changed(valence, name, change):

@@ -162,8 +162,7 @@ def test_passes_of_other_images_are_status_3(passes, capsys, words, message):
 def test_a_missing_pass_warns(passes, capsys, tmp_path):
     for there, missing in (("13", "2"), ("2", "1, 3")):
         assert merge(tmp_path / "merged.exr", *(passes / f"{number}.exr" for number in there)) == 0
-        told = capsys.readouterr().err
-        assert told == f"mitsuba-subdivision: warning: of 3 passes, these are missing: {missing}\n"
+        assert capsys.readouterr().err == f"mitsuba-subdivision: warning: of 3 passes, these are missing: {missing}\n"
 
 
 def test_non_finite_references_are_not_written(tmp_path, capsys, monkeypatch):

@@ -65,8 +65,7 @@ def brighter(factor, *part):
 @pytest.mark.parametrize(("first", "second"), [(4, 4), (4, 16), (400, 4)])
 def test_the_relative_error_of_noise_has_its_expectation(first, second, np_rng):
     """Whatever the numbers of samples: the variance of a difference is the sum of both."""
-    images = (random_image(np_rng, first, "reference"), random_image(np_rng, second, "test"))
-    (line,) = compare(*images).notes
+    (line,) = compare(random_image(np_rng, first, "reference"), random_image(np_rng, second, "test")).notes
     measured, expected = map(float, re.fullmatch(r"relMSE (\S+); noise alone would make it (\S+)", line).groups())
     assert abs(measured / expected - 1) < NOISE
 
@@ -101,8 +100,7 @@ def test_unchanged_images_pass(reference, judged):
 
 
 def failures(pairs, alpha):
-    limits = replace(LIMITS, alpha=alpha)
-    return sum(compare(*pair, ["tile"], limits).status is Status.FAIL for pair in pairs)
+    return sum(compare(*pair, ["tile"], replace(LIMITS, alpha=alpha)).status is Status.FAIL for pair in pairs)
 
 
 def images(first, count, batches, **options):
@@ -364,8 +362,7 @@ def noisier(rng, factor, batches=4):
 @pytest.mark.parametrize(("of_reference", "of_test"), [(0, 1), (1, 0.2), (1, 3)])
 def test_each_image_has_its_own_noise(of_reference, of_test):
     """Of 100 seeds, one false alarm may be; of a reference without noise, too. A change of 2 % is seen by all."""
-    rng = np.random.default_rng(7)
-    made = noisier(rng, of_reference, 256)
+    made = noisier(np.random.default_rng(7), of_reference, 256)
     reference, alarms = Image("reference", made.mean, made), 0
     for seed in range(100):
         test = noisier(np.random.default_rng(seed), of_test)

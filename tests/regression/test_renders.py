@@ -69,8 +69,7 @@ def test_merging_by_steps_counts_all_batches_and_keeps_the_probe(loaded):
 
 
 def test_where_the_paired_tier_warns_all_samples_decide_after_a_second_attempt_too(monkeypatch, np_rng):
-    sampling = {"seed": 0, "batch": BATCH, "batches": [[0, 4]]}
-    image = random_image(np_rng, metadata={**METADATA, "sampling": sampling})
+    image = random_image(np_rng, metadata={**METADATA, "sampling": {"seed": 0, "batch": BATCH, "batches": [[0, 4]]}})
     warned, of_tiles = TierResult("paired", Status.WARN, [""]), iter([Status.FAIL, Status.PASS, Status.FAIL])
 
     def compared(*_):
@@ -255,8 +254,7 @@ def test_parts_contain_all_samples_and_are_of_similar_size(size, spp):
 
 
 def test_small_images_are_one_render_of_mitsuba(loaded):
-    expected = np.array(mi.render(loaded.scene, spp=4, seed=3))
-    np.testing.assert_array_equal(render_image(loaded, 4, 3), expected)
+    np.testing.assert_array_equal(render_image(loaded, 4, 3), np.array(mi.render(loaded.scene, spp=4, seed=3)))
 
 
 def seeds_and_samples(render):

@@ -30,8 +30,7 @@ def load(cage, **parameters):
 
 def textured(**tags):
     """A cube with an island of texture coordinates on each face, turned and sheared."""
-    islands = [[0, 0], [1, 0.2], [0.9, 1], [0.1, 0.8]]
-    values = np.vstack([np.add(islands, [face, 0]) for face in range(6)])
+    values = np.vstack([np.add([[0, 0], [1, 0.2], [0.9, 1], [0.1, 0.8]], [face, 0]) for face in range(6)])
     return cube(texcoords=Attribute(values, "face_varying"), **tags)
 
 

@@ -86,8 +86,7 @@ def test_attributes_of_a_file_equal_those_of_mitsubas_ply(square, shading):
     wavelengths = [450, 500, 550, 600] if mi.is_spectral else []
     by_shape = []
     for shape in (ours, theirs):
-        scene = scene_with(shape=shape)
-        si = scene.ray_intersect(mi.Ray3f([0.3, 0.1, 5], [0, 0, -1], 0, wavelengths))
+        si = scene_with(shape=shape).ray_intersect(mi.Ray3f([0.3, 0.1, 5], [0, 0, -1], 0, wavelengths))
         values = {}
         for name, columns in OF_MITSUBA.items():
             assert dr.all(shape.has_attribute(f"vertex_{name}")), name
@@ -104,8 +103,7 @@ def test_attributes_of_a_file_equal_those_of_mitsubas_ply(square, shading):
     if not mi.is_spectral:
         # The values of the file.
         np.testing.assert_allclose(by_shape[0]["color"], [0.2, 0.5, 0.1], atol=SPECTRUM)
-    given = np.array(mi.traverse(ours)["cage_color"])
-    np.testing.assert_allclose(given, np.tile([0.2, 0.5, 0.1], 4), atol=SPECTRUM)
+    np.testing.assert_allclose(np.array(mi.traverse(ours)["cage_color"]), np.tile([0.2, 0.5, 0.1], 4), atol=SPECTRUM)
 
 
 @shadings
@@ -150,8 +148,7 @@ def test_meshes_of_polygons_have_spectra_as_well(name, count):
 @exact
 @pytest.mark.usefixtures("variant_llvm_ad_spectral", "no_other_scene")
 def test_frozen_functions_look_up_spectra(square):
-    shape = {"type": "subdivision", "filename": square, "shading": "exact"}
-    scene = scene_with(shape=shape)
+    scene = scene_with(shape={"type": "subdivision", "filename": square, "shading": "exact"})
     parameters = mi.traverse(scene)
 
     def spectrum(scene, x):
@@ -161,8 +158,7 @@ def test_frozen_functions_look_up_spectra(square):
     frozen = dr.freeze(spectrum)
     for grey in (0.25, 0.75, 0.5):
         update(parameters, {"shape.cage_color": dr.full(mi.Float, grey, 12)})
-        looked_up = frozen(scene, mi.Float(-0.1 * grey, 0.1, 0.2))
-        np.testing.assert_allclose(np.array(looked_up), grey, atol=SPECTRUM)
+        np.testing.assert_allclose(np.array(frozen(scene, mi.Float(-0.1 * grey, 0.1, 0.2))), grey, atol=SPECTRUM)
     # The last values were looked up without Python.
     assert frozen.n_recordings < 3
 

@@ -7,7 +7,7 @@ from patches.closed_cages import cube_with_hexagon, extraordinary_triangles
 from reference.refined_cages import refine_first
 from shapes.cages import MIRRORED, RING, SHEARED, bitmap, cube, described, load, with_attributes
 from shapes.scenes import down, perspective, rays, scene_with
-from shapes.updates import MODES, derivative, moving
+from shapes.updates import MODES, derivative, differentiated, moving
 from shapes.variants import every_ad_variant, exact, exact_llvm, llvm
 
 pytestmark = pytest.mark.usefixtures("no_other_scene")
@@ -148,8 +148,7 @@ def test_derivatives_of_vertices_are_central_differences(named, by, displacement
     (cage, scheme), heights = named, {}
     if displacement:
         heights = {**HEIGHTS, "displacement": bitmap(IMAGE) if displacement == "bitmap" else displacement}
-    shape = load(cage, scheme=scheme, to_world=mi.ScalarTransform4f(matrix), **heights)
-    parameters = mi.traverse(shape)
+    parameters = mi.traverse(load(cage, scheme=scheme, to_world=mi.ScalarTransform4f(matrix), **heights))
     buffers = [f"vertex_{name}" for name in ("positions", "normals", "texcoords", *cage.attributes)]
     sizes = {name: dr.width(parameters[name]) for name in buffers}
     weights = {name: upload(mi.Float, np_rng.normal(size=size) / np.sqrt(size)) for name, size in sizes.items()}
@@ -184,14 +183,11 @@ def test_a_joined_cage_has_the_picture_and_the_gradients_of_its_cages():
         sensor = perspective(32, (6, -9, 7), fov=30)
         scene = scene_with(**shapes, sensor=sensor, light={"type": "constant"}, integrator={"type": "prb"})
         parameters = mi.traverse(scene)
-        keys = [f"{name}.control_points" for name in shapes]
-        for key in keys:
-            dr.enable_grad(parameters[key])
-        parameters.update()
+        points = [differentiated(parameters, f"{name}.control_points") for name in shapes]
         picture = mi.render(scene, parameters, spp=4, seed=1)
         dr.backward(dr.mean(dr.square(picture), axis=None))
         pictures.append(picture.numpy())
-        gradients.append(np.concatenate([np.array(dr.grad(parameters[key])) for key in keys]))
+        gradients.append(np.concatenate([np.array(dr.grad(values)) for values in points]))
     assert pictures[0].std() > 0.1
     np.testing.assert_allclose(*pictures, rtol=0, atol=ORDER)
     np.testing.assert_allclose(*gradients, rtol=0, atol=ORDER * np.abs(gradients[0]).max())

@@ -114,8 +114,7 @@ class Truth:
 
 def locations(cage, rate=RATE, scheme=None):
     surface = LimitSurface(cage, scheme)
-    table = surface.sampling(rate)
-    return surface.attribute_table(table)[0].locate()
+    return surface.attribute_table(surface.sampling(rate))[0].locate()
 
 
 def heights(kind):

@@ -167,8 +167,7 @@ def test_rays_through_folds_move_less_than_a_triangle_and_symmetrically(np_rng):
 
     def met_by_rays(mirror, shading="exact"):
         to_world = mi.ScalarTransform4f().scale(mirror)
-        shape = make(cage, tessellation_rate=1, to_world=to_world, shading=shading)
-        return hits(shape, rays(o * mirror, d * mirror))
+        return hits(make(cage, tessellation_rate=1, to_world=to_world, shading=shading), rays(o * mirror, d * mirror))
 
     exact, mirrored, coarse = met_by_rays([1, 1, 1]), met_by_rays([-1, 1, 1]), met_by_rays([1, 1, 1], "vertex")
     met = np.array(coarse.is_valid())

@@ -17,6 +17,7 @@ from mitsuba_subdivision.shapes import exact_shading, interaction_hook, machine_
 from reference.refined_cages import sheet
 from shapes.cages import described, load
 from shapes.scenes import down, hit, perspective, rows, scene_with
+from shapes.updates import differentiated
 from shapes.variants import every_array_variant, llvm, printed
 
 pytestmark = pytest.mark.threads
@@ -108,8 +109,7 @@ def test_an_error_is_raised_once_by_its_cause(monkeypatch, capfd):
 def test_errors_pass_through_loops_and_derivatives(monkeypatch):
     scene = scene_of(make(), "prb")
     parameters = mi.traverse(scene)
-    dr.enable_grad(parameters["shape.control_points"])
-    parameters.update()
+    differentiated(parameters, "shape.control_points")
     picture = mi.render(scene, parameters, spp=1)
     complete_by(monkeypatch, fail)
     with raises_answer():
@@ -226,8 +226,7 @@ for shading in ("vertex", "exact"):
 # Many renders, which take most of their time in answers.
 @llvm
 def test_an_interruption_is_raised_after_mitsuba_returns():
-    turns = printed(BEGIN + INTERRUPTED).splitlines()
-    assert [turn.split()[0] for turn in turns] == ["vertex"] * 2 + ["exact"] * 2
+    assert [turn.split()[0] for turn in printed(BEGIN + INTERRUPTED).splitlines()] == ["vertex"] * 2 + ["exact"] * 2
 
 
 @pytest.fixture
@@ -284,8 +283,7 @@ def test_instances_of_groups_side_by_side_are_as_placed_shapes():
 
     def met_in(scene, key):
         parameters = mi.traverse(scene)
-        dr.enable_grad(parameters[key])
-        parameters.update()
+        differentiated(parameters, key)
         si = scene.ray_intersect(ray)
         dr.backward(dr.sum(dr.select(si.is_valid(), dr.dot(si.p + si.sh_frame.n, mi.Vector3f(1, 2, 3)), 0)))
         values, gradient = (*si.p, *si.sh_frame.n, *si.dp_du, *si.uv, si.is_valid()), dr.grad(parameters[key])
@@ -350,8 +348,7 @@ def test_no_collection_comes_between_the_hits_of_a_kernel(monkeypatch):
         """Hits and collections of each kernel, as letters."""
         scene = scene_of(cube(), "prb")
         parameters = mi.traverse(scene)
-        dr.enable_grad(parameters["shape.control_points"])
-        parameters.update()
+        differentiated(parameters, "shape.control_points")
         events.clear()
         if threshold is not None:
             gc.set_threshold(gc.get_count()[0] + threshold)

@@ -162,8 +162,7 @@ def test_methods_agree_with_a_mesh_of_the_same_triangles(shading, tmp_path):
 @exact_llvm
 def test_methods_under_exact_shading_use_the_surface_or_raise():
     shape, surface = made("exact"), LimitSurface(CAGE)
-    scene = scene_with(shape=shape)
-    si = scene.ray_intersect(mi.Ray3f([0.1, 0.2, 5], [0.01, 0, -1]))
+    si = scene_with(shape=shape).ray_intersect(mi.Ray3f([0.1, 0.2, 5], [0.01, 0, -1]))
     p = numbers(si.p)
     close(si.uv, p[:2], HIT)
     for size in ("", "_3"):

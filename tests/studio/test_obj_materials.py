@@ -146,8 +146,7 @@ def test_ignored_options_of_maps_warn(texture):
 def test_a_changed_picture_is_saved_with_its_scene(tmp_path, texture):
     texture(f"map_Kd -s 2 3 -o 0.5 -mm 0.5 0.25 {NAME}")
     corners, faces = np.tile([[0.0, 0], [1, 0], [1, 1], [0, 1]], (6, 1)), cube().face_vertices.reshape(-1, 4)
-    texcoords = Attribute(corners, "face_varying")
-    cage = ControlCage(cube().positions, faces, texcoords=texcoords, materials={"a": range(6)})
+    cage = ControlCage(cube().positions, faces, texcoords=Attribute(corners, "face_varying"), materials={"a": range(6)})
     cage.save(tmp_path / "cube.obj")
     (tmp_path / "cube.obj").write_text("mtllib a.mtl\n" + (tmp_path / "cube.obj").read_text())
     scene = studio_scene(tmp_path / "cube.obj", size=(16, 12), spp=16, rate=2, shading="vertex")

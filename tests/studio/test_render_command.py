@@ -236,8 +236,7 @@ def test_still_pictures_follow_the_sensor_and_others_do_not(folder, capfd):
 @llvm
 def test_outlines_are_within_the_error():
     """The part of each pixel that a black model covers is that of a much finer one, but for a strip along its edge."""
-    size = 48, 36
-    made, fine = (msub.studio_scene(CUBE, size=size, spp=256, **more) for more in ({}, {"rate": 64}))
+    made, fine = (msub.studio_scene(CUBE, size=(48, 36), spp=256, **more) for more in ({}, {"rate": 64}))
 
     def covered(scene):
         kept = {name: scene[name] for name in ("type", "sensor", "integrator")}

@@ -1,10 +1,8 @@
-import warnings
-
 import numpy as np
 import pytest
 from fuzz.topologies import random_cage
 from kernels.surfaces import KINDS, SURFACES, surface_named
-from mitsuba_subdivision import CageError, CageWarning, ControlCage, LimitSurface, SchemeError
+from mitsuba_subdivision import CageError, ControlCage, LimitSurface, SchemeError
 from mitsuba_subdivision.cage.errors import without_warnings
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.tessellation import adaptive
@@ -148,8 +146,7 @@ SPECIAL = {
 @pytest.mark.parametrize("seed", [*range(12), 17, 82, 115, 114, 468, *SPECIAL])
 def test_any_cage_has_an_adaptive_tessellation(seed):
     """Without cracks wherever the uniform one has none, whatever the cage: not manifold, folded, cut or collapsed."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CageWarning)
+    with without_warnings():
         try:
             surface = LimitSurface(*SPECIAL.get(seed) or random_cage(np.random.default_rng(seed)))
         except (CageError, SchemeError) as refused:

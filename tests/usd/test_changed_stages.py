@@ -50,8 +50,7 @@ def test_a_transparent_picture_over_the_background_is_the_picture(tmp_path):
     # Rays meet two walls; some pixels lie on their outline.
     walls = behind[..., 3][(alpha[..., 0] == 0) & (behind[..., 3] > 0.2)]
     assert np.quantile(walls, 0.75) == pytest.approx(1 - 0.6**2, abs=0.06)
-    head = 'renderSettingsPrimPath = "/settings"'
-    asks = stages.write(tmp_path, whole + settings, "asks.usda", head=head)
+    asks = stages.write(tmp_path, whole + settings, "asks.usda", head='renderSettingsPrimPath = "/settings"')
     np.testing.assert_array_equal(rendered(asks), clear)
     # Eight bits have colours that are not multiplied by alpha.
     assert command(write(tmp_path, whole), "--transparent", to="p.png") == 0

@@ -278,8 +278,7 @@ def test_packages_hold_documents_and_their_pictures(tmp_path):
         for name in ("stage.usda", "looks/red.mtlx", "tex/color.png"):
             archive.AddFile(str(tmp_path / name.rpartition("/")[2]), name)
     assert material(package).inputs["base_color"].file == f"{package}[tex/color.png]"
-    pixels = np.array(msub.usd_scene(package, mi)["Looks_Red"]["bsdf"]["base_color"]["bitmap"])
-    assert (pixels == 255).all()
+    assert (np.array(msub.usd_scene(package, mi)["Looks_Red"]["bsdf"]["base_color"]["bitmap"]) == 255).all()
 
 
 POSITIONS = element("position", "p", "vector3")
@@ -310,17 +309,13 @@ TOLD = [
 @pytest.mark.parametrize(("text", "message"), TOLD)
 def test_unsupported_features_warn_once(stage, tmp_path, text, message):
     flat(tmp_path / "black.png", [0] * 3)
-    path = stage(text, RED_SQUARE + RED_SQUARE.replace('"square"', '"other"'))
-    _, messages = told(StageReader(path).at)
+    _, messages = told(StageReader(stage(text, RED_SQUARE + RED_SQUARE.replace('"square"', '"other"'))).at)
     assert sum(message in warning for warning in messages) == 1 if message else not messages
 
 
 ADDRESS = 'string inputs:uaddressmode = "{0}"'
 ADDRESSES = f"{ADDRESS}\n{ADDRESS.replace(':u', ':v')}"
 TEXCOORD = "ND_texcoord_vector2", ""
-SECOND_TEXCOORD = "ND_texcoord_vector2", "int inputs:index = 1"
-# An input of an image, what its coordinates are, and what is told.
-
 OTHER_INPUTS = [
     ('string inputs:layer = "some"', "layer"),
     ('string inputs:filtertype = "closest"', "filtertype"),
@@ -336,7 +331,7 @@ IGNORED_INPUTS = [
     (ADDRESS.format("clamp"), TEXCOORD, "vaddressmode of textures is ignored; uaddressmode applies to both"),
     ("float inputs:gain = 2", TEXCOORD, "does not have are ignored (gain of /Red/image)"),
     ("color3f inputs:default.connect = </Red/tone.outputs:out>", TEXCOORD, "default of images is ignored unless it is"),
-    ("", SECOND_TEXCOORD, "index of texcoord is ignored; the first set of the mesh"),
+    ("", ("ND_texcoord_vector2", "int inputs:index = 1"), "index of texcoord is ignored; the first set of the mesh"),
 ]
 
 
@@ -359,8 +354,7 @@ def test_ignored_inputs_of_images_and_coordinates_warn_once_by_name(tmp_path, no
 def test_inputs_of_other_types(tmp_path):
     """Words in place of numbers are as if they were not there; too few numbers are no colour."""
     words = 'string inputs:specular_roughness = "rough"\n'
-    paint = material(write(tmp_path, network("standard_surface", words)))
-    assert paint.inputs["roughness"] == pytest.approx(0.2)
+    assert material(write(tmp_path, network("standard_surface", words))).inputs["roughness"] == pytest.approx(0.2)
     path = write(tmp_path, network("standard_surface", f"{words}float2 inputs:base_color = (1, 0)"))
     with pytest.warns(CageWarning, match="inputs have other types"):
         assert StageReader(path).at().materials == []
@@ -400,5 +394,4 @@ def test_pictures_have_the_colours_of_materials(stage, red, body, expected):
     """A furnace: a square that reflects a part of a white sky, or a body that lets it through."""
     scene = msub.usd_scene(stage(red, VIEW + mesh("square", *body, bound("Looks/Red"))), mi, size=(8, 8), spp=1024)
     assert (scene["integrator"]["type"] == "volpath") == (red == GLASS)
-    image = np.array(mi.render(mi.load_dict(scene)))
-    np.testing.assert_allclose(image.mean(axis=(0, 1)), expected, rtol=0.02)
+    np.testing.assert_allclose(np.array(mi.render(mi.load_dict(scene))).mean(axis=(0, 1)), expected, rtol=0.02)

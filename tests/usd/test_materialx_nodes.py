@@ -95,8 +95,7 @@ def test_ramps_and_splits_lie_as_the_specification_says(monkeypatch):
     assert baked(RAMP, None)[2] == "clamp"
     given = {"amplitude": 1.0, "pivot": 0.0, "octaves": 3.0, "lacunarity": 2.0, "diminish": 0.5, "texcoord": UV}
     for noise in ("noise2d", "fractal2d", "cellnoise2d"):
-        noisy = node("add", "float", in1=RAMP, in2=node(noise, "float", **given))
-        assert baked(noisy, None)[2] == "repeat"
+        assert baked(node("add", "float", in1=RAMP, in2=node(noise, "float", **given)), None)[2] == "repeat"
 
 
 def _hash(*words):
@@ -174,8 +173,7 @@ def source(pixels):
 def test_pictures_of_one_place_are_joined_there(monkeypatch):
     """At the resolution of the larger one, in the place where both lie, some rows at a time."""
     monkeypatch.setattr(textures, "_PIXELS_AT_ONCE", 18)
-    random = np.random.default_rng(4)
-    pixels = {"a.png": random.random((4, 6, 3)), "b.png": np.full((2, 3, 1), 0.25)}
+    pixels = {"a.png": np.random.default_rng(4).random((4, 6, 3)), "b.png": np.full((2, 3, 1), 0.25)}
     tiled = [[2, 0, 0.5], [0, 3, 0], [0, 0, 1]]
     expression = node("mix", "color3", bg=picture(to_uv=tiled), fg=[1.0, 0.0, 0.0], mix=picture("r", "b.png", tiled))
     values, to_uv, _ = baked(expression, source(pixels))
@@ -186,8 +184,7 @@ def test_pictures_of_one_place_are_joined_there(monkeypatch):
 def test_images_at_different_coordinates_are_baked_over_the_unit_square(monkeypatch):
     """A picture of one texel for each quarter, and the same twice as often along u."""
     pixels = {"a.png": np.array([[[1.0], [0.0]], [[0.0], [1.0]]])}
-    often = np.diag([2.0, 1.0, 1.0])
-    expression = node("multiply", "float", in1=picture("r"), in2=picture("r", to_uv=often))
+    expression = node("multiply", "float", in1=picture("r"), in2=picture("r", to_uv=np.diag([2.0, 1.0, 1.0])))
     values, _, wrap = baked(expression, source(pixels))
     assert (values.shape, wrap) == ((4, 4, 1), "repeat")
     # Bilinear between the centres of texels.

@@ -100,8 +100,7 @@ def test_joints_and_blend_shapes_move_control_points(tmp_path, time):
 
 def test_dual_quaternions_blend_a_twist_by_its_angle(tmp_path):
     """Half of a turn about the tube's axis is the half turn, without the loss of width of linear blending."""
-    path = write(tmp_path, "dualQuaternion", axis=(0, 1, 0), blends=False)
-    middle = read_usd(path, time=5).positions[8:12] - MOVE
+    middle = read_usd(write(tmp_path, "dualQuaternion", axis=(0, 1, 0), blends=False), time=5).positions[8:12] - MOVE
     cosine, sine = cos(radians(BEND / 2)), sin(radians(BEND / 2))
     expected = RING @ [[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]] + [0, 2, 0]
     np.testing.assert_allclose(middle, expected, atol=FLOAT32)
@@ -109,8 +108,7 @@ def test_dual_quaternions_blend_a_twist_by_its_angle(tmp_path):
 
 def test_normals_of_polygons_follow_the_joints(tmp_path):
     """At the ends, where one joint moves a point, normals turn with it."""
-    path = write(tmp_path, scheme="none", blends=False)
-    (shape,) = StageReader(path).at(5).shapes
+    (shape,) = StageReader(write(tmp_path, scheme="none", blends=False)).at(5).shapes
     points, weights = tube()
     normals = points * [1, 0, 1]
     bent = turned(normals, BEND) - turned(0 * normals, BEND)

@@ -186,8 +186,7 @@ def test_changes_between_frames_are_shown(tmp_path):
     text = prim("Mesh", "hidden", CUBE, 'token visibility.timeSamples = {1: "invisible", 3: "inherited"}') + MOVING
     text += prim("Mesh", "other", POINTS.replace("(1,", "(4,"), faces)
     text += STILL.replace("displayColor = [(.1,.2,.7)]", "displayColor.timeSamples = {1: [(1,0,0)], 5: [(0,1,0)]}")
-    moving = frame_range(write(tmp_path, text), range(1, 6, 2))
-    scenes = list(moving.frames([1, 3, 5], "box"))
+    scenes = list(frame_range(write(tmp_path, text), range(1, 6, 2)).frames([1, 3, 5], "box"))
     shapes = [len(frame.scene.shapes()) for frame in scenes]
     assert shapes[1] == shapes[0] + 1
     assert len({str(mi.traverse(frame.scene)["sensor.to_world"]) for frame in scenes}) == 1
@@ -202,9 +201,8 @@ def test_changes_between_frames_are_shown(tmp_path):
 def test_a_saved_stage_renders_to_the_same_picture(tmp_path):
     path = write(tmp_path, WHOLE)
     written = save_scene(StillPicture(StageScenes(path, LOOK, RATE, time=2)).scene, tmp_path / "saved" / "moving.xml")
-    suffixes = Counter(path.suffix for path in written)
     # The cubes are one file.
-    assert suffixes == {".obj": 2, ".ply": 2, ".png": 1, ".exr": 2, ".xml": 1}
+    assert Counter(path.suffix for path in written) == {".obj": 2, ".ply": 2, ".png": 1, ".exr": 2, ".xml": 1}
     np.testing.assert_allclose(pixels(load_scene(written[-1], None, "box")), alone(path, 2), atol=1e-5)
 
 
@@ -218,8 +216,7 @@ AFAR = prim("Camera", "camera", LENS, moved(translate=(535, 528, 2), rotateX=80)
 @scalar
 def test_parts_of_a_mesh_are_saved_with_their_faces_and_a_camera_far_from_the_origin(tmp_path):
     path = write(tmp_path, PARTS + SPECK + AFAR)
-    scene = StillPicture(StageScenes(path, LOOK, RATE)).scene
-    written = save_scene(scene, tmp_path / "parts.xml")
+    written = save_scene(StillPicture(StageScenes(path, LOOK, RATE)).scene, tmp_path / "parts.xml")
     # All parts of a mesh read one file.
     assert Counter(path.suffix for path in written) == {".obj": 2, ".xml": 1}
     loaded = load_scene(written[-1], None, "box")
@@ -356,8 +353,7 @@ def crossing(folder, opens, closes):
 def test_shutters_blur_a_moving_square_by_its_time_in_a_pixel(tmp_path):
     """Pixels are a quarter wide: from one of 16 sub-frames to the next, the square moves by a quarter of one."""
     left = -2 + 0.25 * np.arange(16)
-    moment = np.linspace(0.25, 0.75, 20001)[:, None]
-    start = -2 + 2 * moment
+    start = -2 + 2 * np.linspace(0.25, 0.75, 20001)[:, None]
     covered = np.clip(np.minimum(start + 1, left + 0.25) - np.maximum(start, left), 0, 0.25).mean(axis=0) / 0.25
     picture = str(tmp_path / "a.exr")
     options = "--size 16x8 --spp 64 --filter box -m scalar_rgb --time 0.5 --shutter 16"

@@ -41,8 +41,7 @@ def look(model, **given):
 def entry(material):
     notes = StageWarnings()
     cage = CageContents(np.zeros((3, 3)), np.array([3]), np.arange(3))
-    shape = ShapeContents("/shape", cage, np.eye(4), material=material)
-    return bsdf(shape, Textures(notes), notes), notes
+    return bsdf(ShapeContents("/shape", cage, np.eye(4), material=material), Textures(notes), notes), notes
 
 
 def bsdf_of(model, **given):
