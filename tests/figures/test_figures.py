@@ -228,9 +228,14 @@ def test_a_cage_causes_its_warning_once(options, tmp_path):
     assert "own.obj" in str(warning.message)
 
 
-@pytest.mark.usefixtures("variant_llvm_ad_rgb")
+@pytest.mark.usefixtures("variant_llvm_ad_rgb", "coarse")
 def test_unsuitable_cages_for_figures_are_errors(options, tmp_path):
     torus(5, 4).save(tmp_path / "torus.obj")
+    # A regular cage is suitable for this one, and so is a vertex that no face uses.
+    assert FIGURES["subdivision"](options(formats=("png",), cage=tmp_path / "torus.obj"))
+    (tmp_path / "unused.obj").write_text("v 9 9 9\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 2 3 4 5\n")
+    with pytest.warns(CageWarning, match="1 of 5 vertices are used by no face"):
+        assert FIGURES["subdivision"](options(formats=("png",), cage=tmp_path / "unused.obj"))
     for name, message in (("error", "no extraordinary vertex"), ("creases", "no creases")):
         with pytest.raises(FigureError, match=f'torus.obj" has {message}'):
             FIGURES[name](options(cage=tmp_path / "torus.obj"))

@@ -2,7 +2,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_subdivision import ControlCage, LimitSurface
+from mitsuba_subdivision import ControlCage, LimitSurface, upload
 from mitsuba_subdivision.cage.named_cages import cube
 from mitsuba_subdivision.fit import CageFit, View, fitting
 from reference.refined_cages import tagged
@@ -204,6 +204,18 @@ def test_nothing_is_compiled_after_the_second_step(views):
     assert all(kernel["cache_hit"] for kernel in kernels)
 
 
+def test_adaptive_shapes_and_given_texels_are_fitted_and_refined_before_the_first_step(views):
+    texels = upload(mi.TensorXf, np.full((2, 2, 3), 0.5))
+    bsdf = {"type": "diffuse", "reflectance": {"type": "bitmap", "data": texels, "raw": True}}
+    fit = made(cube(), views, shape={"bsdf": bsdf, "tessellation": "adaptive", "chord_error": 0.1}, refine=[0, 2]).run(
+        3
+    )
+    assert (fit.refinements, texels.shape) == (2, (2, 2, 3))
+    assert np.isfinite(fit.losses).all()
+    with pytest.raises(ValueError, match="every 0; expected 1 or more"):
+        fit.run(1, every=0)
+
+
 def test_callbacks_see_each_step_and_a_cage_keeps_its_tags(views, tmp_path):
     creased, seen = tagged(cube(), creases=[(0, 1, 2.0)]), []
     fit = made(creased, views, callbacks=[lambda fit: seen.append(len(fit.losses))]).run(3)
@@ -235,6 +247,8 @@ PICTURE = np.zeros((SIZE, SIZE, 3))
         ({"sharp_edges": [(0, 1)], "crease_of": [1]}, "crease_of skips crease 0; expected consecutive indices from 0"),
         ({"sharp_edges": [(0, 1)], "crease_of": [-1]}, "crease_of has a crease -1; expected consecutive indices fr"),
         ({"learning_rate": "high"}, "learning_rate is 'high'; expected a number"),
+        ({"spp": 0}, "spp 0; expected 1 or more"),
+        ({"shape": {"holes": [0]}}, 'shape has "holes", which a refinement renumbers; expected it in the cage'),
     ],
 )
 def test_invalid_fits_are_errors(changes, message):

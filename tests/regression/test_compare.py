@@ -1,5 +1,6 @@
 """The tiers on synthetic images, whose truth is known."""
 
+import json
 import math
 import re
 from dataclasses import replace
@@ -208,6 +209,7 @@ def test_non_finite_pixels_fail_first_and_by_name(reference, np_rng, value, role
     assert (statuses(result), result.worst.x, result.worst.y) == ({"finite": "fail"}, 5, 3)
     (line,) = result.tier("finite").lines
     assert line == f"the {role} is not: G = {value} at x = 5, y = 3 and at 2 more pixels; channels R, G"
+    assert str(value) in json.dumps(result.as_dict(), allow_nan=False)
 
 
 def other_triangles(count):
@@ -388,6 +390,7 @@ def test_alpha_is_compared_and_warns_if_one_image_lacks_it():
             result = compare(*pair, missing=missing)
             assert result.exit_status == status
             assert f"only the {role} has A" in str(result)
+    assert compare(plain, replace(opaque, pixels=opaque.pixels * [1, 1, 1, np.inf]), missing="ignore").exit_status == 0
     with pytest.raises(RegressionError, match='missing channels "x"; expected one of ignore, warn, fail'):
         compare(plain, plain, missing="x")
 
@@ -445,6 +448,10 @@ def test_flip_sees_changes_of_plain_images_and_refuses_non_finite_ones():
     assert [score["flip_mean"] < LIMITS.flip_mean for score in scores] == [True, True, False]
     assert all(score["exposures"] == list(flip_exposures(truth())) for score in scores)
     assert flip(truth(), LIMITS.with_values({"flip_mean": 0, "flip_p95": 0})).status is Status.PASS
+    # As of normals
+    signed, limits = truth() - truth().mean(), LIMITS
+    made = [compare_flip(Image("a", signed), Image("b", pixels), limits) for pixels in (signed, np.maximum(signed, 0))]
+    assert [result.status for result in made] == [Status.PASS, Status.FAIL]
     broken = truth()
     broken[0, 0] = np.nan
     with pytest.raises(RegressionError, match="not finite"):

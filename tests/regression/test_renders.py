@@ -106,6 +106,12 @@ def test_the_filter_is_replaced_whether_the_scene_names_one_or_not(variants_all_
     assert load_scene(named, filter_name="box").filter == "box"
     described = {"type": "scene", "sensor": {"type": "perspective", "film": {"type": "hdrfilm"}}}
     assert load_scene(described, filter_name="box").filter == "box"
+    for kind, integrator in (("xyz", {"type": "path"}), ("luminance", {"type": "aov", "aovs": "d:depth"})):
+        film = {"type": "hdrfilm", "pixel_format": kind}
+        with pytest.raises(
+            RegressionError, match=r"the film has the pixel format \w+; expected rgb, rgba, or luminance"
+        ):
+            load_scene({"type": "scene", "integrator": integrator, "sensor": {"type": "perspective", "film": film}})
     with pytest.raises(RegressionError, match='has the reconstruction filter "gaussian"'):
         load_scene(mi.load_dict(described), filter_name="box")
 

@@ -94,8 +94,10 @@ def write_frames(options: argparse.Namespace) -> None:
 
 def write_image(options: argparse.Namespace, picture: Picture, path: Path) -> None:
     """Write a picture, and its products beside it, if they are several, or the picture's format has no AOVs."""
-    colors = [name for name in picture.channels if name in "RGBA"]
-    is_exr = path.suffix.lower() == ".exr"
+    is_exr, kept = path.suffix.lower() == ".exr", "RGB" if path.suffix.lower() == ".jpg" else "RGBA"
+    colors = [name for name in picture.channels if name in kept]
+    if path.suffix.lower() == ".hdr" and len(colors) == 1:
+        colors *= 3  # The format has no grey
     images = {path: [*picture.channels] if is_exr else colors}
     if len(picture.products) > 1 or (not is_exr and len(colors) < len(picture.channels)):
         for name, layers in picture.products.items():

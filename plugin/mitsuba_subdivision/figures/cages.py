@@ -133,7 +133,7 @@ def edge_curves(surface: LimitSurface, half_edges: NDArray[np.integer], segments
 
 def _is_extraordinary(topology: Topology) -> NDArray[np.bool_]:
     """``(n_v,)`` whether an inner vertex has a valence other than 4."""
-    return (topology.vertex_face_count != 4) & ~topology.is_border_vertex
+    return ~np.isin(topology.vertex_face_count, (0, 4)) & ~topology.is_border_vertex
 
 
 # Panels of the figure `creases`, and their titles.

@@ -170,7 +170,7 @@ def visible(scene: mi.Scene, points: NDArray[np.floating]) -> NDArray[np.bool_]:
     backward = -to_world[:3, 2]
     start = points + LIFT * points_at(points, np.linalg.inv(to_world))[:, 2:] * backward
     towards = mi.Vector3f(*(backward / np.linalg.norm(backward)).tolist())
-    if "scalar" in str(mi.variant()):
+    if "scalar" in str(mi.variant()) or not len(points):
         return np.array([not scene.ray_test(mi.Ray3f(mi.Point3f(p), towards)) for p in start], dtype=bool)
     return ~np.array(scene.ray_test(mi.Ray3f(upload(mi.Point3f, start), towards)))
 

@@ -30,6 +30,8 @@ U, SHARPNESS = "u", "sharpness"  # Variables of the optimiser: coordinates of co
 # Moving outlines need a projective integrator. Few scenes need gradients of shadows.
 DEFAULT_INTEGRATOR = {"type": "direct_projective", "sppi": 0}
 DEFAULT_SHAPE = {"tessellation_rate": 4}
+# Parameters of the shape that number faces or vertices of its cage.
+NUMBERED = ("shown_faces", "holes", "creases", "corners")
 
 Loss = Literal["l1", "l2"] | Callable[["mi.TensorXf", int], "mi.TensorXf"]
 COLLAPSED = 1e-4  # Size relative to the initial surface at which triangles have no area in single precision
@@ -179,7 +181,13 @@ class CageFit(Fit):
             raise ValueError(f'laplacian "{laplacian}"; expected "cage" or "surface"')
         if crease_of is not None and sharp_edges is None:
             raise ValueError("crease_of without sharp_edges; expected both")
-        self._shape = {**DEFAULT_SHAPE, **(shape or {}), **({} if scheme is None else {"scheme": scheme})}
+        if spp < 1:
+            raise ValueError(f"spp {spp}; expected 1 or more")
+        shape = shape or {}
+        if numbered := [name for name in NUMBERED if name in shape]:
+            raise ValueError(f'shape has "{numbered[0]}", which a refinement renumbers; expected it in the cage')
+        rate = {} if shape.get("tessellation") == "adaptive" else DEFAULT_SHAPE
+        self._shape = {**rate, **shape, **({} if scheme is None else {"scheme": scheme})}
         self._entries = {"type": "scene", "integrator": DEFAULT_INTEGRATOR, **scene}
         integrator = self._entries["integrator"]
         if isinstance(integrator, Mapping) and str(integrator.get("type", "")).endswith("_projective"):
@@ -207,9 +215,11 @@ class CageFit(Fit):
         if creases is not None:
             cage, halvings = creases.refined, creases.highest  # Each refinement halves the segments of edges
             self._others[SHARPNESS] = upload(mi.Float, creases.initial)
-        rate = max(1, self._shape["tessellation_rate"] >> halvings)
-        shape = {"type": "subdivision", **cage.as_properties(mi), **self._shape, "tessellation_rate": rate}
-        self._scene = mi.load_dict({**self._entries, SHAPE: shape})
+        shape = {"type": "subdivision", **cage.as_properties(mi), **self._shape}
+        if "tessellation_rate" in shape:
+            shape["tessellation_rate"] = max(1, shape["tessellation_rate"] >> halvings)
+        # Copied, as bitmaps take their tensors away.
+        self._scene = mi.load_dict(dr.copy({**self._entries, SHAPE: shape}))
         self._params = mi.traverse(self._scene)
         self._steps: LargeSteps | None = None
         if self._smoothing:

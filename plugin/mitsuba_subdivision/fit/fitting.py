@@ -111,6 +111,8 @@ class Fit(ABC):
             File for `save_checkpoint` after every ``every`` steps, at the end, and of the last whole step after Ctrl-C.
         every : int
         """
+        if every < 1:
+            raise ValueError(f"every {every}; expected 1 or more")
         if checkpoint is None:
             for _ in counted(range(steps), "Steps"):
                 self.step()
@@ -130,7 +132,7 @@ class Fit(ABC):
 
     def _is_time_to_refine(self, number: int) -> bool:
         if not isinstance(self._refine, int):
-            return number in self._refine and self._since > 0
+            return number in self._refine and (self._since > 0 or number == self.refinements == 0)
         if self.refinements >= self._refine or self._since < 2 * STEPS_OF_MEAN:
             return False
         before, now = np.mean(np.reshape(self.losses[-2 * STEPS_OF_MEAN :], (2, -1)), axis=1)

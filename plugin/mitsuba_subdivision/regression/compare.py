@@ -99,13 +99,17 @@ class Comparison:
         return [f"{tier.name}: {'; '.join(tier.lines)}" for tier in tiers]
 
     def as_dict(self) -> dict[str, Any]:
+        worst: Any = self.worst and dict(vars(self.worst))
+        for image in ("reference", "test") if worst else ():
+            # JSON has finite numbers only.
+            worst[image] = [value if np.isfinite(value) else str(value) for value in worst[image]]
         return {
             "status": self.status.value,
             "reference": self.reference.name,
             "test": self.test.name,
             "tiers": {t.name: {"status": t.status.value, "lines": t.lines, **t.numbers} for t in self.tiers},
             "notes": self.notes,
-            "worst_pixel": vars(self.worst) if self.worst else None,
+            "worst_pixel": worst,
             "tolerances": self.tolerances.as_dict(),
             **self.numbers,
         }
@@ -139,14 +143,13 @@ def compare(
         raise RegressionError(f'unknown tier "{unknown[0]}"; expected some of {", ".join(TIERS)}')
     limits = tolerances or Tolerances().with_values(reference.metadata.get("tolerances", {}))
 
+    names = tuple(name for name in reference.names if name in test.names)
+    of_missing = _missing(reference, test, missing)
+    reference, test = (image.with_channels(names) for image in (reference, test))
     for image, role in ((test, "test"), (reference, "reference")):
         if broken := image.not_finite():
             result = TierResult("finite", Status.FAIL, [f"the {role} is not: {broken[0]}"], worst=broken[1])
             return Comparison(reference, test, [result], limits)
-
-    names = tuple(name for name in reference.names if name in test.names)
-    of_missing = _missing(reference, test, missing)
-    reference, test = (image.with_channels(names) for image in (reference, test))
     strict = replace(limits, alpha=limits.alpha / suite_size)
 
     def compared(name: str) -> TierResult:

@@ -100,6 +100,10 @@ def load_scene(
         sensors = "one sensor, 0" if count == 1 else f"sensors 0 to {count - 1}"
         raise RegressionError(f"there is no sensor {sensor_index}; the scene has {sensors}")
     film = scene.sensors()[sensor_index].film()
+    pixel_format = str(film).partition("pixel_format = ")[2].partition(",")[0]
+    if pixel_format.startswith("xyz") or (pixel_format.startswith("y") and scene.integrator().aov_names()):
+        expected = "rgb, rgba, or luminance without AOVs"
+        raise RegressionError(f'"{path or "scene"}": the film has the pixel format {pixel_format}; expected {expected}')
     # The filter prints "BoxFilter[]" for "box".
     filter_of_scene = str(film.rfilter()).partition("[")[0].removesuffix("Filter").lower()
     if isinstance(source, mi.Scene) and filter_name not in (None, filter_of_scene):

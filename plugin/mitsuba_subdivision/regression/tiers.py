@@ -419,12 +419,15 @@ def compare_flip(reference: Image, test: Image, tolerances: Tolerances) -> TierR
     if not (np.isfinite(reference.pixels).all() and np.isfinite(test.pixels).all()):
         raise RegressionError("FLIP does not see pixels that are not finite; expected finite images")
     start, stop, count = flip_exposures(reference.rgb)
-    # Arrays, as FLIP ends the process at unreadable files; nonnegative, as its tone curve has poles.
-    arrays = [np.ascontiguousarray(np.maximum(image.rgb, 0), dtype=np.float32) for image in (reference, test)]
+    # Arrays, as FLIP ends the process at unreadable files.
+    both = [np.ascontiguousarray(image.rgb, dtype=np.float32) for image in (reference, test)]
     exposures = {"startExposure": start, "stopExposure": stop, "numExposures": count, "tonemapper": "ACES"}
     without = {"applyMagma": False, "computeMeanError": False}
-    of_rgb, _, _ = flip_evaluator.evaluate(*arrays, "HDR", parameters=exposures, **without)
-    errors = {"R, G, B": np.asarray(of_rgb, dtype=np.float64)[..., 0], **_errors_of_others(reference, test)}
+    # Nonnegative, as its tone curve has poles; negative values by their size.
+    signs = (1, -1) if min(pixels.min() for pixels in both) < 0 else (1,)
+    pairs = [[np.maximum(sign * pixels, 0) for pixels in both] for sign in signs]
+    of_rgb = [flip_evaluator.evaluate(*pair, "HDR", parameters=exposures, **without)[0] for pair in pairs]
+    errors = {"R, G, B": np.max(of_rgb, axis=0)[..., 0].astype(np.float64), **_errors_of_others(reference, test)}
     seen = reference.seen_with(test)
     means = {name: float(values[seen].mean()) for name, values in errors.items()}
     p95s = {name: float(np.percentile(values[seen], 95)) for name, values in errors.items()}
