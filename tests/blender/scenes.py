@@ -170,6 +170,8 @@ def make_model(model):
     moved = add_subdivided("Würfel 1.001", mesh)
     moved.location, moved.rotation_euler, moved.scale = (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), (-1.0, 1.5, 2.0)
     moved.modifiers.new("Thickness", "SOLIDIFY")
+    for frame in (0, 2):
+        moved.keyframe_insert("location", frame=frame, index=0)
     mirrored = add("mirrored", mesh)
     mirrored.modifiers.new("Mirror", "MIRROR").use_axis = (False, True, False)
     subdivide(mirrored)
@@ -248,8 +250,13 @@ def make_shown(model):
     line.inputs["Count"].default_value = 3
     group.links.new(group.nodes.new("GeometryNodeMeshCube").outputs["Mesh"], on_points.inputs["Instance"])
     cube("nodes", "NODES")[1].node_group = group
-    cube("thick", "SUBSURF", "SOLIDIFY")
+    # USD has one name for both, and none begins with a digit.
+    cube("2nd.thick", "SUBSURF", "SOLIDIFY")
+    cube("2nd_thick")
     key, _ = cube("key", "SUBSURF")
+    cube("wrapped", "SHRINKWRAP")[1].target = key
+    leaving = cube("leaving")[0]
+    leaving.location.y = -60  # Behind the camera.
     key.shape_key_add(name="Basis")
     shape = key.shape_key_add(name="Larger")
     for point in shape.data:
@@ -276,11 +283,13 @@ def make_shown(model):
     for owner, name, values in (
         (shape, "value", (0.0, 1.0)), (camera, "ortho_scale", (25.0, 25.1)), (sun, "energy", (1.0, 3.0)),
         (holder, "scale", ((1, 1, 1), (1, 1, 1.5))), (bone, "rotation_euler", ((0, 0, 0), (0.8, 0, 0))),
-        (store.inputs["Value"], "default_value", (0.0, 0.9)),
+        (store.inputs["Value"], "default_value", (0.0, 0.9)), (leaving, "hide_render", (False, True)),
     ):  # fmt: skip
         for frame, value in zip((1, 3), values, strict=True):
             setattr(owner, name, value)
             owner.keyframe_insert(name, frame=frame)
+    for frame, thing in ((1, scene.camera), (3, add("Other", camera))):
+        scene.timeline_markers.new("cut", frame=frame).camera = thing
     scene.frame_set(1)
     names = shoot(model, frame=2)
     scene.frame_set(1)
@@ -301,7 +310,7 @@ def make_shown(model):
     from pxr import Usd  # noqa: F401, for the context
 
     bpy.utils.register_class(Seen)
-    bpy.ops.wm.usd_export(filepath=model + ".usda", evaluation_mode="RENDER")
+    bpy.ops.wm.usd_export(filepath=model + ".usda", evaluation_mode="RENDER", export_subdivision="TESSELLATE")
     bpy.utils.unregister_class(Seen)
     return names, found
 
@@ -344,7 +353,7 @@ class Tile:
             mesh = bpy.data.meshes.new(f"tile_{self.number}")
             mesh.from_pydata([(-1, 0, -1), (1, 0, -1), (1, 0, 1), (-1, 0, 1)], [], [(0, 1, 2, 3)])
             mesh.uv_layers.new(name="Main")
-            for corner in mesh.uv_layers.new(name="Second").data:
+            for corner in mesh.uv_layers.new(name="Map.2").data:
                 corner.uv *= 2
         row, column = divmod(self.number, COLUMNS)
         self.thing = add(mesh.name, mesh, (DISTANCE * (column - 1.5), 0, DISTANCE * (1 - row)))
@@ -396,7 +405,7 @@ def tiles(folder):
     tile = Tile()
     tile.set(Normal=tile.node("NormalMap", {"Strength": 0.7, "Color": tile.picture(dents)["Color"]})["Normal"])
     tile = Tile()
-    second = {0: 1.0, 6: tile.picture(ramp, tile.node("UVMap", uv_map="Second")["UV"])["Color"], 7: (0.9, 0.4, 0.6, 1)}
+    second = {0: 1.0, 6: tile.picture(ramp, tile.node("UVMap", uv_map="Map.2")["UV"])["Color"], 7: (0.9, 0.4, 0.6, 1)}
     tile.set(Base_Color=tile.node("Mix", second, data_type="RGBA", blend_type="MULTIPLY")[2])
     Tile(Alpha=0.5, Base_Color=(0.9, 0.2, 0.1, 1.0))
     tile = Tile()
@@ -404,13 +413,14 @@ def tiles(folder):
     tile = Tile()
     colors = tile.thing.data.color_attributes.new("Tint", "FLOAT_COLOR", "POINT").data
     colors.foreach_set("color", [1.0, 0.2, 0.1, 1.0] * 2 + [0.2, 0.5, 1.0, 1.0] * 2)
-    tile.set(Base_Color=tile.node("VertexColor", layer_name="Tint")["Color"])
+    tile.set(Base_Color=tile.node("VertexColor")["Color"])
     tile = Tile()
     tile.show(tile.node("Emission", {"Color": (0.2, 0.6, 0.1, 1.0)})[0])
     # Behind the camera, what has no place in the file.
     tile = Tile()
     tile.thing.location, tile.thing.visible_shadow = (0, -30, 0), False
     tile.show(tile.node("BsdfGlass")[0])
+    tile.set(Alpha=tile.node("VertexColor", layer_name="Tint")["Alpha"], Base_Color=tile.node("TexVoronoi")["Color"])
     aim("Lamp", "AREA", spread=1.0, energy=0.0)
 
 
@@ -437,6 +447,7 @@ def make_look(model):
     aim("Spot", "SPOT", (-3, -10, 0), (math.pi / 2, 0, 0), energy=400.0, **cone)
     lens = aim("Camera", None, (0, -12, 0), (math.pi / 2, 0, 0), lens=40.0, shift_x=0.0625, shift_y=-0.03125).dof
     lens.use_dof, lens.focus_distance, lens.aperture_fstop = True, 12.0, 0.5
+    bpy.context.scene.unit_settings.scale_length = 0.01
     return shoot(model), {}
 
 

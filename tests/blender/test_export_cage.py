@@ -179,16 +179,16 @@ def test_points_equal_those_of_a_render(shown):
     assert {name: len(parts) for name, parts in (found | cages).items()} == counts
     # A bevel of 12 sides has 6 rings in renders, and 3 in the viewport.
     assert {name: len(parts[0]) for name, parts in cages.items()} == {
-        **dict.fromkeys(("part", "thick", "key", "rigged", "creased"), 8),
+        **dict.fromkeys(("part", "2nd.thick", "key", "rigged", "creased"), 8),
         "wire": 72,
     }
     for name, parts in found.items():
         assert distance(np.concatenate(parts), np.concatenate(expected[name])) < POINT_TOLERANCE, name
-    assert 'object "thick": modifiers below "Subsurf" are left out: Solidify' in told
+    assert 'object "2nd.thick": modifiers below "Subsurf" are left out: Solidify' in told
 
 
 def test_animated_properties_have_samples(shown):
-    stage, _, _ = shown
+    stage, _, told = shown
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (1, 3)
 
     def values(path, *times):
@@ -200,6 +200,9 @@ def test_animated_properties_have_samples(shown):
     np.testing.assert_allclose(values("Sun/Sun.inputs:intensity", 1, 3), [1, 3], rtol=1e-6)
     np.testing.assert_allclose(values("Camera/Camera.horizontalAperture", 1, 3), [250, 251], rtol=1e-6)
     np.testing.assert_allclose(values("Camera/Camera.shutter:close", 1), [0.25])
+    assert stage.GetAttributeAtPath("/root/leaving/Mesh.visibility").Get(3) == "invisible"
+    assert 'markers change the camera: the file has "Camera" at all frames' in told
+    assert stage.GetRelationshipAtPath("/Render/Settings.camera").GetTargets() == ["/root/Camera/Camera"]
     np.testing.assert_allclose(values("holder.xformOp:scale", 3), [[1, 1, 1.5]], rtol=1e-6)
     np.testing.assert_allclose(np.unique(values("creased/Mesh.creaseSharpnesses", 1, 2)), [0, 2.025], rtol=1e-6)
 
@@ -230,15 +233,21 @@ def test_objects_are_as_bright_as_in_cycles(made, kind):
 
 
 def test_omissions_are_printed(made):
-    told = made("look")[2]
+    usda, _, told = made("look")
     for what in (
         'light "Lamp": left out: its spread',
         'object "tile_12": left out: rays to which it is invisible (shadow)',
         'material "paint_12": the Glass BSDF is left out',
+        'material "paint_12": the Voronoi Texture is left out',
+        'material "paint_12": the Alpha of "Tint" at "Alpha" is left out',
     ):
         assert told.count(f"export_cage: {what}") == 1, told
     # What is written is not told.
     assert all(f'"paint_{number}"' not in told for number in range(12))
+    # Blender interpolates colours linearly, also on surfaces.
+    stage = Usd.Stage.Open(str(usda))
+    assert stage.GetAttributeAtPath("/root/tile_10/Mesh.primvars:Tint").GetMetadata("interpolation") == "varying"
+    assert stage.GetAttributeAtPath("/root/Camera/Camera.fStop").Get() == 50  # 0.5, in units of a centimetre.
 
 
 def test_an_obj_file_has_the_same_cage(scene, tmp_path):
@@ -257,7 +266,7 @@ def test_an_obj_file_has_the_same_cage(scene, tmp_path):
     for rows in ("creases", "corners"):
         np.testing.assert_allclose(getattr(result.contents, rows), getattr(expected.contents, rows), rtol=1e-7)
     # In OBJ files faces of a mirrored object are turned over; readers of USD do it themselves.
-    done = blender(SCRIPT, obj, "--object", "Würfel 1.001", scene=blend)
+    done = blender(SCRIPT, obj, "--object", "Würfel 1.001", "--animation", scene=blend)
     assert done.returncode == 0, done.stderr
     ours, theirs = (points_and_texcoords(c) for c in (msub.ControlCage.from_file(obj), cage_of(usda, "Würfel 1.001")))
     assert distance(ours, theirs) < TOLERANCE
