@@ -152,7 +152,6 @@ def test_the_error_of_exact_shading_in_scalar_variants_names_the_variant():
 
 @llvm
 def test_without_the_hook_automatic_shading_uses_vertex_normals(monkeypatch):
-    monkeypatch.setattr(interaction_hook, "_hooks", {})
     monkeypatch.setattr(interaction_hook, "hook_problem", lambda: "needs another computer")
     assert problem() == "exact shading needs another computer"
     automatic = load(cube(), shading="auto")

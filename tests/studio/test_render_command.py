@@ -268,7 +268,6 @@ def test_scalar_variants_keep_vertex_normals_with_one_message(capfd):
 @llvm
 @pytest.mark.usefixtures("folder")
 def test_the_command_prints_one_line_about_missing_exact_shading(monkeypatch, capfd, words):
-    monkeypatch.setattr(interaction_hook, "_hooks", {})
     monkeypatch.setattr(interaction_hook, "hook_problem", lambda: "needs another computer")
     assert render("cube.obj", "-o", "a.png", *TINY, *words, "-m", "llvm_ad_rgb") == 0
     assert capfd.readouterr().err.count("exact shading needs another computer\n") == 1

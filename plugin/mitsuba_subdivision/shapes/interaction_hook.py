@@ -93,11 +93,13 @@ def exact_shading_problem(
     """Reason for which ``shading="auto"`` selects interpolated vertex normals; None if it selects exact shading."""
     if not dr.is_jit_v(variant.Float):
         return "exact shading needs a variant of llvm or cuda"
-    try:
-        interaction_hook(variant)
-    except RuntimeError as error:
-        return f"exact shading {error}"
-    return None
+    problem = hook_problem()
+    if problem is None:
+        try:
+            interaction_hook(variant)
+        except RuntimeError as error:
+            problem = str(error)
+    return problem and f"exact shading {problem}"
 
 
 def interaction_hook(variant: Variant) -> InteractionHook:
