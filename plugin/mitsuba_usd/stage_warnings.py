@@ -45,11 +45,9 @@ class StageWarnings:
 
     def warn(self, name: str) -> None:
         """Issue a warning for each new kind; messages begin with the name of the file."""
-        for kind, of_kind in self._prims.items():
-            if kind in self._warned:
-                continue
+        for kind in (kind for kind in self._prims if kind not in self._warned):
             self._warned.add(kind)
-            prims = list(of_kind)
+            prims = list(self._prims[kind])
             if kind not in self._first:
                 warn(f"{name}: {kind} ({listed(prims, _SHOWN)})")
             elif len(prims) == 1:
