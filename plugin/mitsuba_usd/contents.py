@@ -246,9 +246,7 @@ class SceneContents:
     @property
     def placements(self) -> dict[ShapeContents, NDArray[np.float64]]:
         """Transforms ``(n, 4, 4)`` to the world of each shape; of a shape in a group, one for each instance."""
-        found: dict[ShapeContents, list[NDArray[np.float64]]] = {}
-        for shape in self.shapes:
-            found.setdefault(shape, []).append(shape.to_world)
+        found = {shape: [shape.to_world] for shape in self.shapes}
         for instance in self.instances:
             for shape in self.groups[instance.group]:
                 found.setdefault(shape, []).append(instance.to_world @ shape.to_world)

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 from mitsuba_subdivision.cage import Attribute, CageContents, CageSource
-from mitsuba_subdivision.files import reversed_order
-from mitsuba_subdivision.mesh import IntArray
+from mitsuba_subdivision.mesh import IntArray, ragged
 from mitsuba_subdivision.mitsuba_mesh import points_at
 from mitsuba_subdivision.studio import available_memory
 from numpy.typing import NDArray
@@ -127,7 +126,7 @@ def _copied(shape: ShapeContents, matrices: NDArray[np.float64], name: str) -> S
     positions = points_at(np.asarray(cage.positions, dtype=np.float64), matrices)
     # Corners of the faces of each copy, in reversed order for mirrored copies.
     is_mirrored = np.linalg.det(linear) < 0
-    corners = np.where(is_mirrored[:, None], reversed_order(cage.face_sizes), np.arange(len(cage.face_vertices)))
+    corners = np.where(is_mirrored[:, None], ragged.reversed_order(cage.face_sizes), np.arange(len(cage.face_vertices)))
     # First vertex and face of each copy.
     vertex, face = (step * np.arange(count)[:, None] for step in (len(cage.positions), len(cage.face_sizes)))
     normals = shape.normals

@@ -103,8 +103,7 @@ _UNTEXTURED = {"distant": _distant, "sphere": _sphere, "point": _point, "spot": 
 def one_environment(lights: list[LightContents], notes: StageWarnings) -> list[LightContents]:
     """The lights with at most one dome, the first with a texture, as Mitsuba's scenes have one environment."""
     domes = [light for light in lights if light.kind == "dome"]
-    kept = next((light for light in domes if light.texture), domes[0] if domes else None)
-    left = [light for light in domes if light is not kept]
+    left = sorted(domes, key=lambda light: not light.texture)[1:]
     for light in left:
         notes.add("further dome lights are ignored; a scene of Mitsuba has one environment", light.name)
     return [light for light in lights if light not in left]
@@ -272,12 +271,10 @@ def with_studio_defaults(
     scene["sensor"] = seen if camera is None else sensor(camera, size, contents.picture, look.spp, notes)
     if is_lit:
         return scene
-    for name in (name for name in STUDIO if name in entries):
+    for name in (name for name in STUDIO if name in entries and (camera is None or name != "ground")):
         # A stage's camera may be so far away that it would see the lights of a studio.
         is_near = camera is not None and entries[name]["type"] == "rectangle"
         scene[name] = _distant_light(entries[name], bounds.mean(axis=0)) if is_near else entries[name]
-    if camera is not None:
-        scene.pop("ground", None)
     return scene
 
 

@@ -78,9 +78,8 @@ class ShapeReader:
         shapes = []
         # Parts whose materials need the same primvars share their arrays.
         cages: dict[tuple[tuple[str, ...], str | None], CageContents] = {}
-        for number, material in enumerate(materials):
-            if not (owner == number).any():
-                continue
+        for number in np.flatnonzero(np.bincount(owner)).tolist():
+            material = materials[number]
             names = self._primvars(material)
             if names not in cages:
                 cages[names] = self._without_alpha(prim, reader.contents(*names))
@@ -104,12 +103,18 @@ class ShapeReader:
         prim = mesh.GetPrim()
         materials = [self._materials.bound(prim)]
         owner = np.zeros(len(reader.array(mesh.GetFaceVertexCountsAttr(), np.int64, required=True)), dtype=np.int64)
+
+        def faces_of(indices: Usd.Attribute, name: str) -> IntArray:
+            faces = reader.array(indices, np.int64)
+            require_range(faces, len(owner), f"{reader.location}: subset {name} has")
+            return faces
+
         for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
             if value_at(subset.GetElementTypeAttr(), self._time) != "face":
                 self._notes.add("materials of subsets other than faces are ignored", subset.GetPath())
                 continue
             name = subset.GetPrim().GetName()
-            read = partial(_faces_of, reader, subset.GetIndicesAttr(), len(owner), name)
+            read = partial(faces_of, subset.GetIndicesAttr(), name)
             faces = reader.fitting(subset.GetIndicesAttr(), f"the subset {name} is left out", read, _NO_FACES)
             material = self._materials.bound(subset.GetPrim())
             if material not in materials:
@@ -191,12 +196,6 @@ class ShapeReader:
         what += "three or four, or two for texture coordinates"
         self._notes.add(what, primvar.GetAttr().GetPath())
         return []
-
-
-def _faces_of(reader: MeshReader, indices: Usd.Attribute, face_count: int, name: str) -> IntArray:
-    faces = reader.array(indices, np.int64)
-    require_range(faces, face_count, f"{reader.location}: subset {name} has")
-    return faces
 
 
 def are_invertible(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:

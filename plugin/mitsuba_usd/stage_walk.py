@@ -187,12 +187,11 @@ class _StageWalk:
             imageable = UsdGeom.Imageable(prim)
             visibility = imageable and files.value_at(imageable.GetVisibilityAttr(), self._code)
             is_abstract = prim != root and prim.GetSpecifier() != Sdf.SpecifierDef
-            if is_abstract or visibility == UsdGeom.Tokens.invisible:
+            is_shown = not is_abstract and visibility != UsdGeom.Tokens.invisible
+            if not is_shown or prim.IsA(UsdGeom.PointInstancer) or (prim.IsInstance() and prim != root):
                 prims.PruneChildren()
-                continue
-            if prim.IsA(UsdGeom.PointInstancer) or (prim.IsInstance() and prim != root):
-                prims.PruneChildren()
-            yield prim
+            if is_shown:
+                yield prim
 
     def _add(
         self, prim: Usd.Prim, name: str, root: Usd.Prim, to_root: NDArray[np.float64], below: SceneContents

@@ -19,14 +19,12 @@ class StageWarnings:
 
     def __init__(self, ignored: Iterable[str] = ()) -> None:
         self._warned = set(ignored)
-        self._prims: dict[str, list[str]] = {}
+        self._prims: dict[str, dict[str, None]] = {}  # In the order in which they were added
         self._first: dict[str, str] = {}  # First message of each kind whose messages name a prim
 
     def add(self, what: str, prim: object) -> None:
         """Record a problem of a prim, with its consequence, in the words of its kind."""
-        prims = self._prims.setdefault(what, [])
-        if str(prim) not in prims:
-            prims.append(str(prim))
+        self._prims.setdefault(what, {})[str(prim)] = None
 
     def add_message(self, message: str, prim: object, kind: str | None = None) -> None:
         """Record a message that begins with the names of file and prim, and has details beyond its kind."""
@@ -47,10 +45,9 @@ class StageWarnings:
 
     def warn(self, name: str) -> None:
         """Issue a warning for each new kind; messages begin with the name of the file."""
-        for kind, prims in self._prims.items():
-            if kind in self._warned:
-                continue
+        for kind in (kind for kind in self._prims if kind not in self._warned):
             self._warned.add(kind)
+            prims = list(self._prims[kind])
             if kind not in self._first:
                 warn(f"{name}: {kind} ({listed(prims, _SHOWN)})")
             elif len(prims) == 1:

@@ -321,12 +321,10 @@ def validated_edges(topology: Topology, edges: ArrayLike, source: CageSource) ->
         raise CageError(f"{source.name}: edges of shape {ends.shape} and type {ends.dtype}; expected integers, (n, 2)")
     ends = ends.astype(np.int64).reshape(-1, 2)
     half_edges = _half_edges_between(t, *ends.T).astype(np.int64)
-    is_first = np.zeros(len(half_edges), dtype=bool)
-    is_first[np.unique(t.edge[half_edges], return_index=True)[1]] = True
     for holds, problem, expected in (
         (half_edges >= 0, "is no edge of a face", "edges of two faces"),
         (t.twin[half_edges] >= 0, "is infinitely sharp, as it does not have two faces", "edges of two faces"),
-        (is_first, "is given twice", "each edge once"),
+        (~manifold.is_later(t.edge[half_edges]), "is given twice", "each edge once"),
     ):
         for row in np.flatnonzero(~holds)[:1]:
             counting = f"(numbers count from {source.index_base})"

@@ -86,7 +86,7 @@ class MeshReader:
         points = self.skinning.points(mesh, points)
         matrix = np.eye(4) if is_local else self._local_to_world()
         mirrors = bool(np.linalg.det(matrix[:3, :3]) < 0)
-        order = reversed_order(sizes) if mirrors != self.is_left_handed() else None
+        order = ragged.reversed_order(sizes) if mirrors != self.is_left_handed() else None
         vertices = vertices if order is None else vertices[order]
         if not np.array_equal(matrix, np.eye(4)):
             points = points @ matrix[:3, :3] + matrix[3, :3]
@@ -325,7 +325,7 @@ class MeshReader:
             if interpolation not in known:
                 raise self.error(f'normals have the interpolation "{interpolation}"', f"one of {', '.join(known)}")
             indexed = primvar.GetIndicesAttr() if is_primvar and primvar.IsIndexed() else None
-            order = reversed_order(cage.face_sizes) if self.is_left_handed() else None
+            order = ragged.reversed_order(cage.face_sizes) if self.is_left_handed() else None
             normals = self._attribute("normals", values, indexed, interpolation, order, topology)
             return normals.values[topology.face_vertices if normals.indices is None else normals.indices]
 
@@ -407,12 +407,6 @@ def _with_shared_values(
     source[rest] = rest[is_first][np.cumsum(is_first) - 1]
     is_row = np.bincount(source, minlength=len(source)) > 0
     return values[is_row], (np.cumsum(is_row) - 1)[source]
-
-
-def reversed_order(sizes: IntArray) -> IntArray:
-    """Order of face corners that reverses all faces and keeps their first vertices."""
-    index = ragged.index_in_row(sizes)
-    return np.arange(len(index)) - index + -index % np.repeat(sizes, sizes)
 
 
 def _size(value: Any) -> int:

@@ -104,8 +104,6 @@ class SharpMesh:
 
     @cached_property
     def is_boundary_vertex(self) -> NDArray[np.bool_]:
-        if self.non_manifold is None:
-            return self.topology.is_border_vertex
         return self.topology.ends_of(self.is_boundary)
 
     @cached_property

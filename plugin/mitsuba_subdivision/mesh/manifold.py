@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .connectivity import IntArray, Topology
-from .ragged import sorted_order
+from .ragged import reversed_order, sorted_order
 
 # Most corners of faces, all of one size, whose vertices are compared without sorting.
 FEW_CORNERS = 8
@@ -196,8 +196,4 @@ def turning_order(topology: Topology) -> IntArray | None:
     is_turned ^= (2 * np.bincount(component, is_turned) > np.bincount(component))[component]
     if not is_turned.any():
         return None
-    corner_order = np.arange(t.half_edge_count)
-    corners = t.half_edges_of(is_turned)
-    begin, size = t.face_offsets[t.face[corners]], t.face_sizes[t.face[corners]]
-    corner_order[corners] = begin + (size - (corners - begin)) % size
-    return corner_order
+    return np.where(is_turned[t.face], reversed_order(t.face_sizes), np.arange(t.half_edge_count))

@@ -43,15 +43,13 @@ def surroundings(topology: Topology) -> tuple[IndexArray, IndexArray]:
             fans.append(t.turn.take(fans[-1]))
         ordered.append(np.stack(fans if kind % 2 else 2 * fans, axis=1).ravel())
     half_edge = np.concatenate(ordered)
-    start: IndexArray = np.zeros(t.half_edge_count, dtype=np.int32)
-    # Backwards, as the last assignment is kept.
+    row = ragged.first_indices(half_edge, t.half_edge_count)
     if t.common_size:
         count = t.common_size - 2
-        start[half_edge[::-1]] = np.arange(0, count * len(half_edge), count, dtype=np.int32)[::-1]
         ahead = t.face_vertices.take(np.stack(t.around_faces(t.next, count), axis=1))
-        return start, ahead.take(half_edge, axis=0).ravel()
+        return count * row, ahead.take(half_edge, axis=0).ravel()
     counts = t.face_sizes[t.face[half_edge]] - 2
-    start[half_edge[::-1]] = ragged.starts(counts)[::-1]
+    start = ragged.starts(counts).astype(np.int32)[row]
     return start, t.face_vertices.take(t.along_faces(t.next.take(half_edge), counts))
 
 

@@ -50,6 +50,12 @@ def index_in_row(lengths: IntArray) -> NDArray[np.int64]:
     return np.subtract(np.arange(len(index)), index, out=index)
 
 
+def reversed_order(lengths: IntArray) -> NDArray[np.int64]:
+    """Return ``(lengths.sum(),)``: the order of entries that reverses all rows and keeps their first entries."""
+    index = index_in_row(lengths)
+    return np.arange(len(index)) - index + -index % np.repeat(lengths, lengths)
+
+
 def rows(values: Rows, lengths: ArrayLike) -> list[Rows]:
     """Return the rows, of an array as views. `numpy.split` takes ten times as long."""
     return [values[begin:end] for begin, end in pairwise(offsets(lengths).tolist())]

@@ -184,9 +184,8 @@ class PatchTable:
 
     def evaluated_at(self, corners: IntArray) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """`patch_at` in `evaluated`, for half-edges of this table's `elements` at which its patches begin."""
-        return self.evaluated.patch_at(
-            corners if self.refined is None else self.evaluated.topology.face_offsets[corners]
-        )
+        table = self.evaluated
+        return table.patch_at(corners if table is self else table.topology.face_offsets[corners])
 
     def evaluated_points(self, points: FloatArray) -> FloatArray:
         """``(n, k)`` values at the vertices of the mesh of `evaluated`, from those at this table's mesh vertices."""
@@ -267,12 +266,7 @@ class PatchTable:
         length = turn_count * len(corners)
         codes = row_codes([around[column * len(corners) :][:length] for column in columns])
         codes = codes.reshape(turn_count, len(corners))
-        least, turns = codes[0].copy(), np.zeros(len(corners), dtype=np.int32)
-        for turn in range(1, turn_count):
-            is_less = codes[turn] < least
-            turns[is_less] = turn
-            np.minimum(least, codes[turn], out=least)
-        return corners + turns, least
+        return corners + codes.argmin(axis=0).astype(np.int32), codes.min(axis=0)
 
 
 def _over_control_values(stencils: StencilTable, control_of_vertex: IntArray, control_count: int) -> StencilTable:

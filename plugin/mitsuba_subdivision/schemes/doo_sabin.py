@@ -56,12 +56,8 @@ class DooSabin(Scheme):
         # One mask for each face, with a weight for each of its corners: cosines are computed once for each face.
         steps = corners - begin
         mask = np.where(steps == 0, (size + 5) / (4 * size), (3 + 2 * np.cos(2 * np.pi * steps / size)) / (4 * size))
-        corner = np.repeat(corners, size)
-        steps = ragged.index_in_row(size)
-        begin, end = begin[corner], (begin + size)[corner]
-        weight = mask[begin + steps]
-        steps += corner
-        member = t.face_vertices[np.where(steps < end, steps, steps - end + begin)]
+        corner, weight = np.repeat(corners, size), mask[ragged.ranges(begin, size)]
+        member = t.face_vertices[t.along_faces(corners, size)]
         return Refinement(refined, StencilTable.of(t.half_edge_count, t.vertex_count, (corner, member, weight)))
 
     def children(self, topology: Topology, refined: Topology, half_edge: int) -> list[tuple[ParameterMap, int]]:

@@ -53,11 +53,9 @@ class StencilTable:
         """Create a table from several (rows, columns, weights). Entries with the same row and column add up."""
         # int32 halves the memory, as faces with n corners have n² entries, and saves a conversion in `matrix`. Vertices
         # of a cage that is refined once fit into it.
-        every_row, every_column, every_weight = zip(*entries, strict=True)
-        rows, columns = (
-            np.concatenate(indices, dtype=np.int32, casting="same_kind") for indices in (every_row, every_column)
-        )
-        weights = np.concatenate([np.broadcast_to(w, len(r)) for r, w in zip(every_row, every_weight, strict=True)])
+        rows = np.concatenate([r for r, _, _ in entries], dtype=np.int32, casting="same_kind")
+        columns = np.concatenate([c for _, c, _ in entries], dtype=np.int32, casting="same_kind")
+        weights = np.concatenate([np.broadcast_to(w, len(r)) for r, _, w in entries])
         return cls(row_count, column_count, rows, columns, weights)
 
     @classmethod

@@ -380,9 +380,8 @@ class TextureHeights(Heights):
         return gradient
 
     def _differences(self, s: Float, t: Float, active: Mask) -> Sequence[Float]:
-        ends = ((1, 0), (0, 1))
-        ahead, behind = (
-            [self._height(s + step * ds, t + step * dt, active) for ds, dt in ends]
-            for step in (DIFFERENCE, -DIFFERENCE)
-        )
-        return [(a - b) / (2 * DIFFERENCE) for a, b in zip(ahead, behind, strict=True)]
+        slopes = []
+        for ds, dt in ((DIFFERENCE, 0), (0, DIFFERENCE)):
+            ahead, behind = self._height(s + ds, t + dt, active), self._height(s - ds, t - dt, active)
+            slopes.append((ahead - behind) / (2 * DIFFERENCE))
+        return slopes

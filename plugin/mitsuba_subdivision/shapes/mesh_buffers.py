@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..device_arrays import mapped
 from ..kernels.array_types import ArrayTypes, FloatBuffer, IndexBuffer, LaterArrays
-from ..mesh.connectivity import IntArray
+from ..mesh import IntArray, ragged
 from ..mesh.shared import Content, SharedArray, shared, shared_by_key
 from ..schemes.domain import FloatArray
 from ..surface import LimitSurface
@@ -246,8 +246,4 @@ def split_weld_targets(table: VertexTable, layout: AttributeLayout) -> NDArray[n
     if layout.surface_vertex is None and not table.copies.size:
         return None
     target = layout.gathered(table.weld_target)
-    first = np.empty(table.vertex_count, dtype=np.uint32)
-    vertices = np.arange(len(target), dtype=np.uint32)
-    # In repeated assignments the last one counts, so assign in reverse order.
-    first[target[::-1]] = vertices[::-1]
-    return first[target]
+    return ragged.first_indices(target, table.vertex_count)[target].view(np.uint32)

@@ -43,13 +43,9 @@ class AttributeLayout:
         """``(m, 3)``: the vertex table's triangles in the same order, each with its corners in the same order."""
         return self._table.triangles if self.surface_vertex is None else self._grid.triangles()
 
-    @cached_property
-    def _locations(self) -> tuple[IntArray, FloatArray]:
-        return self._grid.locations()
-
     def locate(self) -> tuple[IntArray, FloatArray]:
         """The locations of split vertices, on the vertices' sides of seams; see `UniformGrid.locations`."""
-        return self._table.locations() if self.surface_vertex is None else self._locations
+        return self._grid.locations()
 
     def gathered(self, values: NDArray) -> NDArray:
         """Values at split vertices, from values at the vertices of the vertex table."""
@@ -63,7 +59,7 @@ class AttributeLayout:
             values[table.copies[0]] = values[table.copies[1]]
             return self.gathered(values)
         if layout.is_linear or not isinstance(grid, UniformGrid):
-            return channel.evaluate(*self._locations)
+            return channel.evaluate(*self.locate())
         if layout not in self._tables:
             table = uniform_table(layout.patches, grid.rate)
             self._tables[layout] = table, self._grid.vertices_of(table.grid)

@@ -97,12 +97,10 @@ def _copies(patches: PatchTable, grid: UniformGrid) -> IntArray:
     border = np.flatnonzero(t.twin < 0)
     if patches.scheme.element == "vertex" or not len(border):
         return np.empty((2, 0), dtype=np.int64)
-    used = np.flatnonzero(t.vertex_half_edge >= 0)[::-1]
-    # Vertices are in descending order, so that the first copy of a control point is assigned last and stays.
-    first_copy = np.empty(t.vertex_count, dtype=np.int64)
-    first_copy[control_of_vertex[used]] = used
-    later = used[first_copy[control_of_vertex[used]] != used]
-    at_corners = grid.corner_vertex[np.stack([later, first_copy[control_of_vertex[later]]])]
+    used = np.flatnonzero(t.vertex_half_edge >= 0)
+    control = control_of_vertex[used]
+    first_copy = used[ragged.first_indices(control, patches.control_count)[control]]
+    at_corners = grid.corner_vertex[np.stack([used, first_copy])[:, first_copy != used]]
     # A crease of one edge between darts has two sides, although its ends have no copies.
     start, steps = control_of_vertex[t.face_vertices], np.arange(1, grid.rate)
     original = first_sides(t, border, start)

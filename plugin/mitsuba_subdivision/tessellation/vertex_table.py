@@ -215,8 +215,7 @@ def _of_form(
     powers: IntArray, classes: Sequence[PatchClass], polynomials: Polynomials, runs: VertexRuns
 ) -> VertexPolynomials:
     class_of_block = np.repeat(np.arange(len(classes)), [len(rows) for rows in polynomials.rows])
-    blocks = np.array([(c.first_control, len(c.corners), c.control_count) for c in classes])
-    blocks = blocks[class_of_block]
+    blocks = np.array([(c.first_control, len(c.corners), c.control_count) for c in classes])[class_of_block]
     weights_by_size: dict[int, list[FloatArray]] = {}
     for rows in polynomials.rows:
         if len(rows):
