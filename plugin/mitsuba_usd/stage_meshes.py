@@ -147,11 +147,12 @@ class ShapeReader:
         names = COLORS if material is None else material.primvars()
         constants = {name: self._constant(prim, name) for name in names if name not in cage.attributes}
         constants = {name: values for name, values in constants.items() if values}
-        is_double_sided = value_at(UsdGeom.Gprim(prim).GetDoubleSidedAttr(), self._time)
-        topology = Topology(len(cage.positions), cage.face_sizes, cage.face_vertices)
-        if is_double_sided and material is not None and material.is_emissive and (topology.twin < 0).any():
-            what = "double-sided meshes with a border shine on their front only, as Mitsuba's area lights do"
-            self._notes.add(what, prim.GetPath())
+        is_emissive = material is not None and material.is_emissive
+        if is_emissive and value_at(UsdGeom.Gprim(prim).GetDoubleSidedAttr(), self._time):
+            topology = Topology(len(cage.positions), cage.face_sizes, cage.face_vertices)
+            if (topology.twin < 0).any():
+                what = "double-sided meshes with a border shine on their front only, as Mitsuba's area lights do"
+                self._notes.add(what, prim.GetPath())
         radiance, whole_light = None, None
         if prim.HasAPI(UsdLux.MeshLightAPI):
             whole_light = (whole or cage) if value_at(UsdLux.LightAPI(prim).GetNormalizeAttr(), self._time) else None
@@ -164,14 +165,13 @@ class ShapeReader:
 
     def _with_texcoords(self, prim: Usd.Prim, cage: CageContents, name: str, fallback: Input | None) -> CageContents:
         """A cage with the named texture coordinates, or else with others of its own or the fallback."""
-        if place := self._constant(prim, name, (2,)):
-            return replace(cage, texcoords=Attribute(np.tile(place, (len(cage.positions), 1)), "vertex"))
-        is_missing = not UsdGeom.PrimvarsAPI(prim).HasPrimvar(name)
+        given = self._constant(prim, name, (2,))
+        is_missing = not given and not UsdGeom.PrimvarsAPI(prim).HasPrimvar(name)
         consequence = "the first others of the mesh are used"
-        if cage.texcoords is None or (is_missing and fallback is not None):
-            uv = np.zeros(2) if fallback is None else constant(fallback, 2)
-            consequence = f"textures are read at ({uv[0]:g}, {uv[1]:g})"
-            cage = replace(cage, texcoords=Attribute(np.tile(uv, (len(cage.positions), 1)), "vertex"))
+        if given or cage.texcoords is None or (is_missing and fallback is not None):
+            place = given or ([0.0, 0.0] if fallback is None else constant(fallback, 2).tolist())
+            consequence = f"textures are read at ({place[0]:g}, {place[1]:g})"
+            cage = replace(cage, texcoords=Attribute(np.tile(place, (len(cage.positions), 1)), "vertex"))
         if is_missing:
             self._notes.add(f'texture coordinates "{name}" are missing; {consequence}', prim.GetPath())
         return cage
@@ -192,8 +192,10 @@ class ShapeReader:
             if values.size == 4:
                 self._notes.add(_ALPHA, primvar.GetAttr().GetPath())
             return values.astype(np.float64).ravel()[:3].tolist()
-        what = "constant primvars, and those of solids, are ignored unless they have one value of finite numbers: one, "
-        what += "three or four, or two for texture coordinates"
+        what = (
+            "constant primvars, and those of solids, are ignored unless they have one value of finite numbers: one, "
+            "three or four, or two for texture coordinates"
+        )
         self._notes.add(what, primvar.GetAttr().GetPath())
         return []
 

@@ -65,6 +65,14 @@ def test_options_of_mitsubas_own_program(folder):
     assert pixels("b.exr").shape[:2] == (8, 8)
 
 
+@pytest.mark.parametrize(("kind", "suffix"), [("rgba", ".jpg"), ("luminance", ".hdr")])
+def test_pictures_are_written_without_the_alpha_or_the_grey_that_a_format_lacks(folder, kind, suffix):
+    film = SENSOR.format(8).replace("</film>", f'<string name="pixel_format" value="{kind}"/></film>')
+    (folder / "one.xml").write_text(SCENE.format(CONSTANT + film))
+    assert render("one.xml", "-o", f"a{suffix}", "-m", "scalar_rgb", "--spp", "1") == 0
+    assert pixels(f"a{suffix}").shape == (8, 8, 3)
+
+
 @pytest.mark.usefixtures("folder")
 def test_channels_by_name():
     assert render("cube.obj", "-o", "a.exr", *SMALL, "--aov", "normals,z") == 0

@@ -94,12 +94,14 @@ def write_frames(options: argparse.Namespace) -> None:
 
 def write_image(options: argparse.Namespace, picture: Picture, path: Path) -> None:
     """Write a picture, and its products beside it, if they are several, or the picture's format has no AOVs."""
-    is_exr, kept = path.suffix.lower() == ".exr", "RGB" if path.suffix.lower() == ".jpg" else "RGBA"
-    colors = [name for name in picture.channels if name in kept]
-    if path.suffix.lower() == ".hdr" and len(colors) == 1:
+    suffix, colors = path.suffix.lower(), [name for name in picture.channels if name in "RGBA"]
+    is_exr, has_aovs = suffix == ".exr", len(colors) < len(picture.channels)
+    if suffix == ".jpg" and "A" in colors:
+        colors.remove("A")  # The format has no alpha
+    elif suffix == ".hdr" and len(colors) == 1:
         colors *= 3  # The format has no grey
     images = {path: [*picture.channels] if is_exr else colors}
-    if len(picture.products) > 1 or (not is_exr and len(colors) < len(picture.channels)):
+    if len(picture.products) > 1 or (not is_exr and has_aovs):
         for name, layers in picture.products.items():
             chosen = [channel for channel in picture.channels if channel.rpartition(".")[0] in layers]
             images[path.with_name(f"{path.stem}_{name}.exr")] = chosen

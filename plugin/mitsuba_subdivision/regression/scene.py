@@ -100,6 +100,7 @@ def load_scene(
         sensors = "one sensor, 0" if count == 1 else f"sensors 0 to {count - 1}"
         raise RegressionError(f"there is no sensor {sensor_index}; the scene has {sensors}")
     film = scene.sensors()[sensor_index].film()
+    # Films tell it in their text only: "xyz", "y" for luminance, or others, which are R, G, B.
     pixel_format = str(film).partition("pixel_format = ")[2].partition(",")[0]
     if pixel_format.startswith("xyz") or (pixel_format.startswith("y") and scene.integrator().aov_names()):
         expected = "rgb, rgba, or luminance without AOVs"

@@ -147,6 +147,8 @@ def make_subdivision(
             self._lengths: dict[str, int] = {}
             # The triangles over texture coordinates; None until they are needed. Frozen functions find its arrays here.
             self._texture_scene: Any = None
+            # Buffers of the attribute that a reverse-mode pass reached last: Dr.Jit must not free them during the pass.
+            self._replaced: dict[str, FloatBuffer] = {}
             self._assemble(moves_points=False)
             # Mitsuba has waited for the bounding box, and so for all kernels of this thread.
             self._mesh.settle()
@@ -307,7 +309,6 @@ def make_subdivision(
 
         def renew_attribute(self, name: str, gradients: dict[str, FloatBuffer]) -> None:
             """Attach the arrays computed from an attribute's control values again; see `CageAttributes`."""
-            # Kept, as Dr.Jit must not free what was computed from the attribute during the pass.
             self._replaced = self._get_buffers(mesh_name(name))
             with dr.resume_grad():
                 self._cage.renew(name, gradients[name])
